@@ -1,0 +1,181 @@
+"""Every number that can be set, as frozen dataclasses, and the three scales.
+
+A scale is one argument everywhere: code and notebooks are the same at all of them. What a scale does
+not name here (field of view, map extent, Dice loss, alpha, Adam, batch 16) is the paper's value.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from zerobev.errors import InputError
+
+#: The eight evaluated classes, in the column order of the paper's tables.
+LABELS = ("wall", "floor", "chair", "sofa", "bed", "plant", "toilet", "tv")
+#: Label value of everything that is none of the eight classes.
+NO_LABEL = -1
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """The pinhole FPV camera and the orthographic BEV map in front of it (paper, supplement, "Cameras").
+
+    The FPV image is square, `fpv_px` wide; the map is `bev_px` x `bev_px` cells, row 0 farthest,
+    column 0 leftmost, the camera at the middle of its lower edge.
+    """
+
+    fpv_px: int
+    bev_px: int
+    hfov_deg: float = 79.0
+    height_m: float = 0.88  #: of the pinhole above the floor
+    bev_extent_m: float = 5.0  #: side of the square map
+    bev_above_m: float = 2.0  #: height of the orthographic camera above the pinhole
+    max_height_m: float = 2.0  #: points above this height (over the floor) do not reach the map
+    obstacle_m: float = 0.10  #: a cell higher than this is an obstacle, else it is navigable
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length of the FPV image, pixels."""
+        return 0.5 * self.fpv_px / math.tan(math.radians(self.hfov_deg) / 2)
+
+    @property
+    def cell_m(self) -> float:
+        """Side of a map cell, metres."""
+        return self.bev_extent_m / self.bev_px
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """The *Synth* textures (paper, supplement, "Synth."); one texel is 1 cm in generated homes."""
+
+    share: float = 0.20  #: of white texels in the finished texture
+    opened_share: float = 0.05  #: of white texels before dilation starts
+    kernel_px: tuple[int, int] = (10, 30)  #: smallest and largest kernel of opening and dilation
+    tile_px: int = 1024  #: side of a tile of the texture bank
+    tiles: int = 32  #: number of tiles in the bank
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """How many homes there are, how many views are taken in each, and the seed of both."""
+
+    train: int
+    validation: int
+    test: int
+    views: int  #: per scene
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Widths of the network (paper, supplement, "Architecture Details"); near band first in `ffn`."""
+
+    width: int  #: channels of the pyramid, the transformers and the BEV features
+    block: str  #: residual block of the RGB backbone: "basic" or "bottleneck"
+    depths: tuple[int, int, int, int]  #: residual blocks in each stage of the RGB backbone
+    channels: tuple[int, int, int, int]  #: output channels of each stage
+    stem_channels: int
+    stem_stride: int  #: 2 or 4; stage b has stride stem_stride * 2**b
+    zero_channels: tuple[int, int, int, int]  #: of the small CNN of the zero-shot stream
+    ffn: tuple[int, int, int, int]  #: hidden width of the feed-forward layers, a band
+    decoder_channels: tuple[int, int, int]  #: ResNet stages of the BEV decoder
+    heads: int = 4
+    layers: int = 2  #: of the column encoder, and of the ray decoder
+    dropout: float = 0.1
+    band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)
+    aux: tuple[str, ...] = ("obstacles", "navigable")  #: auxiliary maps predicted beside the zero-shot map
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Optimisation (paper, "Implementation and training details")."""
+
+    steps: int
+    learning_rate: float
+    decay_every: int  #: steps between two multiplications of the learning rate with `decay`
+    validate_every: int  #: steps
+    warmup: int = 0  #: steps of linear warm-up
+    decay: float = 0.9
+    patience: int = 3  #: validations without progress before the learning rate is halved
+    batch: int = 16
+    alpha: float = 0.5  #: weight of the auxiliary loss
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One consistent setting of everything."""
+
+    name: str
+    camera: CameraConfig
+    scenes: SceneConfig
+    model: ModelConfig
+    train: TrainConfig
+    texture: TextureConfig = field(default_factory=TextureConfig)
+
+
+SCALES = {
+    scale.name: scale
+    for scale in (
+        Scale(
+            name="smoke",
+            camera=CameraConfig(fpv_px=32, bev_px=20),
+            scenes=SceneConfig(train=4, validation=1, test=2, views=8),
+            model=ModelConfig(
+                width=16,
+                block="basic",
+                depths=(1, 1, 1, 1),
+                channels=(16, 16, 32, 32),
+                stem_channels=16,
+                stem_stride=2,
+                zero_channels=(8, 8, 16, 16),
+                ffn=(32, 32, 32, 32),
+                decoder_channels=(16, 32, 32),
+                dropout=0.0,
+            ),
+            train=TrainConfig(steps=120, learning_rate=2e-3, decay_every=40, validate_every=40),
+            texture=TextureConfig(tiles=8, tile_px=512),
+        ),
+        Scale(
+            name="reduced",
+            camera=CameraConfig(fpv_px=64, bev_px=40),
+            scenes=SceneConfig(train=200, validation=4, test=32, views=80),
+            model=ModelConfig(
+                width=64,
+                block="basic",
+                depths=(2, 2, 2, 2),
+                channels=(32, 64, 96, 128),
+                stem_channels=32,
+                stem_stride=2,
+                zero_channels=(16, 32, 32, 32),
+                ffn=(128, 128, 128, 128),
+                decoder_channels=(64, 96, 128),
+                dropout=0.0,
+            ),
+            train=TrainConfig(steps=2000, learning_rate=8e-4, decay_every=250, validate_every=250, warmup=50),
+        ),
+        Scale(
+            name="paper",
+            camera=CameraConfig(fpv_px=384, bev_px=100),
+            scenes=SceneConfig(train=145, validation=4, test=32, views=2000),
+            model=ModelConfig(
+                width=256,
+                block="bottleneck",
+                depths=(3, 4, 6, 3),
+                channels=(256, 512, 1024, 2048),
+                stem_channels=64,
+                stem_stride=4,
+                zero_channels=(16, 32, 64, 64),
+                ffn=(128, 128, 512, 512),
+                decoder_channels=(64, 128, 256),
+            ),
+            train=TrainConfig(steps=18_125 * 20, learning_rate=1e-4, decay_every=18_125, validate_every=18_125),
+            texture=TextureConfig(tiles=256, tile_px=2048),
+        ),
+    )
+}
+
+
+def scale(name: str) -> Scale:
+    """The scale called `name`; an unknown name is an `InputError` that lists the known ones."""
+    if name not in SCALES:
+        raise InputError(f"scale: expected one of {', '.join(SCALES)}, found {name!r}")
+    return SCALES[name]
