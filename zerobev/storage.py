@@ -25,7 +25,12 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON with sorted keys and a final newline."""
+def write_json(path: Path, value: dict[str, Any] | list[Any]) -> None:
+    """Write `value` as JSON, one line an entry, so that a change in a committed file is a line in a diff."""
+    if isinstance(value, dict):
+        lines = [f"{json.dumps(key)}: {json.dumps(entry, sort_keys=True)}" for key, entry in sorted(value.items())]
+        text = "{\n" + ",\n".join(lines) + "\n}\n"
+    else:
+        text = "[\n" + ",\n".join(json.dumps(entry, sort_keys=True) for entry in value) + "\n]\n"
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n")
+        temporary.write_text(text)

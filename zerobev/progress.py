@@ -1,0 +1,20 @@
+"""Progress of long work: on a terminal, or into the file that `ZEROBEV_PROGRESS` names; never in a notebook."""
+
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+from tqdm import tqdm
+
+T = TypeVar("T")
+
+
+def progress(items: Iterable[T], what: str, unit: str, total: int, done: int = 0) -> Iterator[T]:
+    """Yield `items`, showing how many of `total` are done (`done` of them before) and when the rest will be."""
+    log = os.environ.get("ZEROBEV_PROGRESS")
+    if log:
+        with open(log, "a") as file:
+            yield from tqdm(items, what, total, initial=done, unit=unit, file=file, mininterval=2, ncols=80)
+    else:
+        yield from tqdm(items, what, total, initial=done, unit=unit, disable=not sys.stderr.isatty())

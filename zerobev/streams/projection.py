@@ -1,0 +1,69 @@
+"""P^-1: projection to the map with known depth, and the field of view on the map (paper, Sections 3 and 8).
+
+Written in torch, since the residual model uses it inside the network; images come in batches.
+"""
+
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull
+
+from zerobev.config import CameraConfig
+from zerobev.sensors.cameras import fpv_rays
+
+
+def map_points(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
+    """Points seen by the pixels of `depth` in the map frame (x right, y forward, z above the floor).
+
+    depth: (..., H, W) planar depth, metres. Returns (..., H, W, 3) of the same dtype, metres.
+    """
+    rays = torch.as_tensor(fpv_rays(camera), dtype=depth.dtype, device=depth.device)
+    return torch.stack([rays[..., 0] * depth, depth, camera.height_m - rays[..., 1] * depth], dim=-1)
+
+
+def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
+    """Index row * M + column of the map cell that each pixel falls into; M * M where it falls into none.
+
+    depth: (..., H, W) planar depth, metres, 0 for nothing seen. Points above `max_height_m` reach no cell.
+    Returns (..., H, W) int64.
+    """
+    x, y, z = map_points(depth, camera).unbind(-1)
+    side = camera.bev_px
+    column = torch.floor((x + camera.bev_extent_m / 2) / camera.cell_m).long()
+    row = side - 1 - torch.floor(y / camera.cell_m).long()
+    on_map = (column >= 0) & (column < side) & (row >= 0) & (row < side)
+    seen = (depth > 0) & (z < camera.max_height_m)
+    return torch.where(on_map & seen, row * side + column, side * side)
+
+
+def project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
+    """P^-1 with max-pooling to the ground: a cell holds the largest value among the pixels that fall into it.
+
+    Counting points in voxels, leaving out those above 2 m, summing over height and thresholding at zero
+    (supplement, "residual variant") marks exactly the cells that some white pixel falls into, whatever the
+    height of a voxel; the maximum over pixels is that, and serves values in [0, 1] as well.
+
+    zero: (B, K, H, W) values >= 0; depth: (B, 1, H, W) metres. Returns (B, K, M, M), 0 where no pixel falls.
+    """
+    batch, modalities = zero.shape[:2]
+    side = camera.bev_px
+    cells = cells_of_pixels(depth, camera).view(batch, 1, -1).expand(batch, modalities, -1)
+    pooled = zero.new_zeros(batch, modalities, side * side + 1)
+    pooled = pooled.scatter_reduce(2, cells, zero.flatten(2), reduce="amax")
+    return pooled[..., :-1].view(batch, modalities, side, side)
+
+
+def fov_mask(depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
+    """(M, M) bool: cells with their centre in the convex hull of all cells that the depth image reaches.
+
+    depth: (H, W) float, metres. The mask is empty where no pixel reaches the map; one cell reached is one
+    cell in the mask, since the hull is that of the cells' corners.
+    """
+    side = camera.bev_px
+    reached = np.unique(cells_of_pixels(torch.from_numpy(depth), camera).numpy())
+    row, column = np.divmod(reached[reached < side * side], side)
+    if not len(row):
+        return np.zeros((side, side), bool)
+    corners = np.concatenate([np.stack([column + dx, row + dy], axis=1) for dx in (0, 1) for dy in (0, 1)])
+    planes = ConvexHull(corners).equations  # (edges, 3): a x + b y + c <= 0 inside
+    centre = np.stack(np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5), axis=-1)
+    return (centre @ planes[:, :2].T + planes[:, 2] <= 1e-9).all(axis=-1)

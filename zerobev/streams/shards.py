@@ -1,0 +1,80 @@
+"""Shards: the views of one scene in one HDF5 file, written whole and read view by view."""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from zerobev.config import CameraConfig
+from zerobev.errors import InputError
+from zerobev.scenes.scene import Scene
+from zerobev.storage import replacing
+from zerobev.streams.views import View
+
+_FIELDS = tuple(field.name for field in fields(View))
+
+
+def write_shard(path: Path, scene: Scene, views: Iterable[View], camera: CameraConfig, seed: int) -> None:
+    """Write `views` of `scene` to `path`; nothing is left behind when a view fails."""
+    with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+        columns = [[getattr(view, name) for name in _FIELDS] for view in views]
+        for name, column in zip(_FIELDS, zip(*columns)):
+            values = np.stack(column)
+            # one chunk a view: a training sample reads one view at random
+            file.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="lzf", shuffle=True)
+        file["instance_label"] = scene.instance_label
+        file.attrs["scene"] = scene.name
+        file.attrs["charts"] = len(scene.chart_instance)
+        file.attrs["camera"] = json.dumps(asdict(camera))
+        file.attrs["seed"] = seed
+
+
+class Shard:
+    """Reads a shard. The file is opened on first use, so that a `Shard` may travel to a worker process.
+
+    Raises `InputError` for a file that is missing, damaged, or recorded with another camera.
+    """
+
+    def __init__(self, path: Path, camera: CameraConfig) -> None:
+        self.path = Path(path)
+        try:
+            with h5py.File(self.path) as file:
+                recorded = json.loads(file.attrs["camera"])
+                self.scene = str(file.attrs["scene"])
+                self.charts = int(file.attrs["charts"])
+                self.instance_label = file["instance_label"][:]
+                self._length = len(file["pose"])
+        except (OSError, KeyError) as error:
+            raise InputError(f"{path}: expected a shard of views, found {_short(error)}") from None
+        if recorded != json.loads(json.dumps(asdict(camera))):
+            raise InputError(f"{path}: expected views of {camera}, found {recorded}")
+        self._file: h5py.File | None = None
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_file": None}
+
+    def view(self, index: int) -> View:
+        """View number `index`."""
+        if self._file is None:
+            self._file = h5py.File(self.path)
+        try:
+            return View(**{name: self._file[name][index] for name in _FIELDS})
+        except (OSError, KeyError) as error:
+            raise InputError(f"{self.path}: expected view {index}, found {_short(error)}") from None
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _short(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,0 +1,90 @@
+"""A view: everything the sensors record at one pose, and the drawing of poses worth recording."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from zerobev.config import AgentConfig, CameraConfig
+from zerobev.errors import InputError
+from zerobev.scenes.scene import Scene
+from zerobev.sensors.cameras import Pose
+from zerobev.sensors.gbuffer import RayCaster
+from zerobev.sensors.photograph import Photographer
+from zerobev.sensors.poses import navigable_floor
+from zerobev.streams.projection import fov_mask
+
+_TRIES = 50  # poses drawn for one view before the scene is given up
+
+
+@dataclass(frozen=True)
+class View:
+    """One pose, complete: any sample of any stream is made of it by look-up. H pixels and M cells a side."""
+
+    rgb: np.ndarray  #: (H, H, 3) uint8 photograph
+    depth: np.ndarray  #: (H, H) float32 planar depth, metres, 0 for nothing
+    fpv_texel: np.ndarray  #: (H, H, 3) int16 chart, row, column; chart -1 for nothing
+    fpv_instance: np.ndarray  #: (H, H) uint16
+    bev_texel: np.ndarray  #: (M, M, 3) int16
+    bev_instance: np.ndarray  #: (M, M) uint16
+    bev_height: np.ndarray  #: (M, M) float32, metres above the floor
+    fov: np.ndarray  #: (M, M) bool: cells inside the field of view
+    pose: np.ndarray  #: (4,) float64: x, y, height of the floor (metres, world), yaw (radians)
+
+
+class ViewSource:
+    """Draws views of one scene. Holds a GL context: free it with `close`, or use `with`."""
+
+    def __init__(
+        self, scene: Scene, camera: CameraConfig, rng: np.random.Generator, agent: AgentConfig | None = None
+    ) -> None:
+        self._agent = agent or AgentConfig()
+        self._camera = camera
+        self._rng = rng
+        self.scene = scene
+        self.floor = navigable_floor(scene, self._agent, rng)
+        self._caster = RayCaster(scene)
+        self._photographer = Photographer(scene, camera)
+
+    def __enter__(self) -> "ViewSource":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._photographer.close()
+
+    def draw(self) -> View:
+        """The view at a fresh pose; poses that face a wall are refused.
+
+        Raises `InputError` where no pose of the scene sees enough of the map.
+        """
+        for _ in range(_TRIES):
+            pose = self.floor.draw(self._rng)
+            view = self.at(pose)
+            if view is not None:
+                return view
+        raise InputError(
+            f"scene {self.scene.name}: expected a view of at least {self._agent.least_view:.0%} of the map, "
+            f"found none in {_TRIES} poses"
+        )
+
+    def at(self, pose: Pose) -> View | None:
+        """The view at `pose`, or None where it sees too little of the map."""
+        fpv = self._caster.fpv(pose, self._camera)
+        fov = fov_mask(fpv.distance, self._camera)
+        if fov.mean() < self._agent.least_view:
+            return None
+        bev = self._caster.bev(pose, self._camera)
+        return View(
+            rgb=self._photographer.take(pose),
+            depth=fpv.distance,
+            fpv_texel=fpv.texel,
+            fpv_instance=fpv.instance,
+            bev_texel=bev.texel,
+            bev_instance=bev.instance,
+            bev_height=bev.distance,
+            fov=fov,
+            pose=np.array([pose.x, pose.y, pose.floor_z, pose.yaw]),
+        )
