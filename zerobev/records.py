@@ -1,0 +1,118 @@
+"""Records: what a run measured and where it came from, one committed JSON file each.
+
+A number in a table comes from a record; a record comes from a command. Beside the counts of every test
+scene a record holds configuration, seed, recipe version, git revision, library versions, device and time.
+"""
+
+import json
+import os
+import platform
+import resource
+import subprocess
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zerobev.errors import InputError
+from zerobev.learning.metrics import Counts
+from zerobev.storage import replacing, write_json
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run: a row of a table with one seed."""
+
+    key: str
+    row: str
+    seed: int
+    config: dict[str, Any]  #: everything the run depends on; its fingerprint is part of the key
+    origin: dict[str, Any]  #: git revision, versions, device
+    cost: dict[str, float]  #: seconds of training and evaluation, peak memory in MB
+    scenes: list[str]  #: test scenes, in the order of the counts
+    counts: Counts
+    history: dict[str, list[float]]  #: training curves by name, empty for a method that is not trained
+
+
+class RecordStore:
+    """The records of one report, in its folders `records` and `gallery`."""
+
+    def __init__(self, reports: Path) -> None:
+        self._records = reports / "records"
+        self._gallery = reports / "gallery"
+
+    def path(self, key: str) -> Path:
+        """Where the record of a run belongs."""
+        return self._records / f"{key}.json"
+
+    def find(self, key: str) -> Record | None:
+        """The record of a run, or None where it has to be made: missing, or older than a call for fresh ones.
+
+        Raises `InputError` for a file that is no record.
+        """
+        path = self.path(key)
+        if not path.exists() or path.stat().st_mtime < float(os.environ.get("ZEROBEV_FRESH", 0)):
+            return None
+        try:
+            found = json.loads(path.read_text())
+            return Record(**{**found, "counts": Counts.from_json(found["counts"])})
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: expected a record of a run, found {error}") from None
+
+    def write(self, record: Record, maps: np.ndarray) -> None:
+        """Keep a record, and the maps it predicted for the gallery, (views, classes, M, M) bool."""
+        with replacing(self._maps_path(record.key)) as temporary:
+            np.savez_compressed(temporary, maps=np.packbits(maps, axis=-1), cells=maps.shape[-1])
+        # the record last: where it is, all of the run is
+        write_json(self.path(record.key), {**asdict(record), "counts": record.counts.to_json()})
+
+    def maps(self, key: str) -> np.ndarray:
+        """The maps of the gallery's views, (views, classes, M, M) bool."""
+        path = self._maps_path(key)
+        try:
+            with np.load(path) as file:
+                return np.unpackbits(file["maps"], axis=-1, count=int(file["cells"])).astype(bool)
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(f"{path}: expected the maps of a run, found {error}") from None
+
+    def write_gallery(self, name: str, **arrays: np.ndarray) -> None:
+        """Keep the inputs of the gallery's views."""
+        with replacing(self._gallery / f"{name}.npz") as temporary:
+            np.savez_compressed(temporary, **arrays)
+
+    def gallery(self, name: str) -> dict[str, np.ndarray] | None:
+        """The inputs of the gallery's views, or None where they have to be made."""
+        path = self._gallery / f"{name}.npz"
+        if not path.exists():
+            return None
+        with np.load(path) as file:
+            return dict(file)
+
+    def _maps_path(self, key: str) -> Path:
+        return self._gallery / f"{key}.npz"
+
+
+def origin(device: str) -> dict[str, Any]:
+    """Where and with what a run is made."""
+    revision = subprocess.run(
+        ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    packages = ("torch", "numpy", "transformers", "accelerate", "embreex", "pyrender", "scikit-image")
+    return {
+        "revision": revision.stdout.strip() or "unknown",
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in packages},
+        "device": device,
+        "cores": os.cpu_count(),
+    }
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, MB."""
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)

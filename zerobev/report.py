@@ -1,0 +1,135 @@
+"""Records and the paper's numbers -> tables, verdicts on claims, and the figures that notebooks share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from zerobev.config import LABELS, CameraConfig
+from zerobev.learning.metrics import Statistic, bootstrap_difference, class_iou, iou_per_class, pixel_iou
+from zerobev.paper import Ordering, Row
+from zerobev.records import Record
+
+#: One colour a class, in the order of `LABELS`; what is none of them is light grey.
+COLORS = ("#4c566a", "#c9b79c", "#e07a1f", "#3a7d44", "#2f6db5", "#7cc36e", "#b04fb0", "#d62839")
+_NOTHING = "#ececec"
+_OUTSIDE = "#ffffff"
+
+_DRAWS = 1000
+_LEVEL = 0.9
+
+
+def table(rows: dict[str, Row], records: Sequence[Record]) -> pd.DataFrame:
+    """The paper's rows above ours, IoU in percent; ours are means over the records' seeds.
+
+    rows: a table of `zerobev.paper.TABLES`. Rows of which there is no record are shown with the paper's
+    numbers alone, so that what is missing is seen.
+    """
+    lines = []
+    for letter, row in rows.items():
+        lines.append((letter, row.method, "paper", *row.per_class, row.class_iou, row.pixel_iou))
+        mine = [record.counts for record in records if record.row == letter]
+        if mine:
+            per_class = np.mean([counts.iou_per_class() for counts in mine], axis=0)
+            averages = np.mean([[counts.class_iou(), counts.pixel_iou()] for counts in mine], axis=0)
+            lines.append((letter, row.method, "ours", *(100 * per_class), *(100 * averages)))
+    columns = ["row", "method", "source", *LABELS, "class avg.", "pixel avg."]
+    return pd.DataFrame(lines, columns=columns).set_index(["row", "method", "source"]).round(1)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim of the paper, held against our records."""
+
+    id: str
+    table: int
+    claim: str
+    paper: float  #: difference in IoU points
+    ours: float | None
+    low: float | None  #: 90 % interval over test scenes
+    high: float | None
+    verdict: str  #: "holds", "does not hold", "undecided", or "not run"
+
+
+def judge(claim: Ordering, rows: dict[str, Row], records: Sequence[Record]) -> Verdict:
+    """Whether the better row is better here too: the interval of the paired difference lies on one side of zero."""
+    published = _published(rows[claim.better], claim.metric) - _published(rows[claim.worse], claim.metric)
+    better, worse = ([r.counts for r in records if r.row == row] for row in (claim.better, claim.worse))
+    named = f"({claim.better}) > ({claim.worse}), {claim.metric} IoU: {claim.text}"
+    if not better or not worse:
+        return Verdict(claim.id, claim.table, named, round(published, 1), None, None, None, "not run")
+    statistic = _statistic(claim.metric)
+    ours = np.mean([c.value(statistic) for c in better]) - np.mean([c.value(statistic) for c in worse])
+    low, high = bootstrap_difference(better, worse, statistic, np.random.default_rng(0), _LEVEL, _DRAWS)
+    verdict = "holds" if low > 0 else "does not hold" if high < 0 else "undecided"
+    points = (round(100 * float(value), 1) for value in (ours, low, high))
+    return Verdict(claim.id, claim.table, named, round(published, 1), *points, verdict)
+
+
+def verdict_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
+    """Claims and verdicts for a notebook, differences in IoU points."""
+    frame = pd.DataFrame([vars(verdict) for verdict in verdicts]).set_index("id").drop(columns="table")
+    return frame.astype({"ours": float, "low": float, "high": float})
+
+
+def _published(row: Row, metric: str) -> float:
+    if metric in LABELS:
+        return row.per_class[LABELS.index(metric)]
+    return row.class_iou if metric == "class" else row.pixel_iou
+
+
+def _statistic(metric: str) -> Statistic:
+    if metric in LABELS:
+        column = LABELS.index(metric)
+        return lambda intersection, union: iou_per_class(intersection, union)[..., column]
+    return {"class": class_iou, "pixel": pixel_iou}[metric]
+
+
+def label_image(label: np.ndarray, fov: np.ndarray | None = None) -> np.ndarray:
+    """(H, W) labels -> (H, W, 3) colours; what lies outside `fov` is white."""
+    palette = np.array([*(_rgb(color) for color in COLORS), _rgb(_NOTHING)])
+    image = palette[label]
+    return image if fov is None else np.where(fov[..., None], image, _rgb(_OUTSIDE))
+
+
+def maps_image(maps: np.ndarray, fov: np.ndarray) -> np.ndarray:
+    """Predicted masks (8, M, M) -> (M, M, 3) colours; where masks overlap, the later class is drawn on top."""
+    label = np.full(maps.shape[1:], len(LABELS))
+    for index, mask in enumerate(maps):
+        if LABELS[index] != "floor":  # floor is below everything that stands on it
+            label = np.where(mask, index, label)
+    label = np.where((label == len(LABELS)) & maps[LABELS.index("floor")], LABELS.index("floor"), label)
+    return label_image(label, fov)
+
+
+def grid(columns: Sequence[tuple[str, Sequence[np.ndarray]]], side: float = 1.5) -> Figure:
+    """A figure of image columns, each with a title and one image a row; 2-D images are shown in grey."""
+    rows = len(columns[0][1])
+    figure, axes = plt.subplots(rows, len(columns), figsize=(side * len(columns), side * rows + 0.3), squeeze=False)
+    for j, (title, images) in enumerate(columns):
+        axes[0, j].set_title(title, fontsize=8)
+        for i, image in enumerate(images):
+            axes[i, j].imshow(image, cmap="gray", interpolation="nearest")
+            axes[i, j].set_axis_off()
+    figure.tight_layout(pad=0.3)
+    return figure
+
+
+def add_legend(figure: Figure) -> None:
+    """The eight classes and their colours, below a figure."""
+    patches = [Patch(color=color, label=name) for name, color in zip(LABELS, COLORS)]
+    figure.legend(handles=patches, loc="lower center", ncols=len(LABELS), fontsize=7, bbox_to_anchor=(0.5, -0.04))
+
+
+def metric_extent(camera: CameraConfig) -> tuple[float, float, float, float]:
+    """`extent` for `imshow` of a map, with metres on both axes."""
+    half = camera.bev_extent_m / 2
+    return (-half, half, 0.0, camera.bev_extent_m)
+
+
+def _rgb(color: str) -> np.ndarray:
+    return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)], np.uint8)

@@ -1,0 +1,67 @@
+"""A data set of generated homes in HM3DSem layout: `python -m zerobev.scenes.homes --out DIR --scale S`.
+
+Home number n of a seed is always the same home, whatever the scale, so that scales share their homes;
+each is written when it is first needed.
+"""
+
+import argparse
+from pathlib import Path
+
+import joblib
+import numpy as np
+
+from zerobev import config
+from zerobev.config import SceneConfig
+from zerobev.errors import run_command
+from zerobev.progress import progress
+from zerobev.scenes.hm3dsem import Split
+from zerobev.scenes.hm3dsem_writer import write_dataset_config, write_scene
+from zerobev.scenes.indoor import generate_home
+
+# HM3D's numbering: training scenes from 0, the minival scenes (our validation) from 800, then the others
+_FIRST = {"train": 0, "minival": 800, "val": 1000}
+
+
+def home_folders(root: Path, scenes: SceneConfig) -> Split:
+    """Where the homes of each split belong, written or not."""
+
+    def folders(part: str, count: int) -> tuple[Path, ...]:
+        return tuple(root / part / f"{n:05d}-Home{n:07d}" for n in range(_FIRST[part], _FIRST[part] + count))
+
+    return Split(folders("train", scenes.train), folders("minival", scenes.validation), folders("val", scenes.test))
+
+
+def ensure_home(folder: Path, seed: int) -> Path:
+    """Generate and write the home that belongs in `folder`, unless it is there."""
+    if not folder.exists():
+        number = int(folder.name.split("-")[0])
+        home = generate_home(folder.name.split("-")[1], np.random.default_rng([seed, number]))
+        write_scene(folder, home)
+    return folder
+
+
+def ensure_homes(folders: list[Path], seed: int, workers: int) -> None:
+    """Generate the homes of `folders` that are missing, in parallel."""
+    missing = [folder for folder in folders if not folder.exists()]
+    jobs = (joblib.delayed(ensure_home)(folder, seed) for folder in missing)
+    written = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
+    for _ in progress(written, "homes", "home", len(missing)):
+        pass
+
+
+def main() -> None:
+    """Parse the command line and write the homes of a scale."""
+    parser = argparse.ArgumentParser(prog="python -m zerobev.scenes.homes", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder to write, in HM3DSem layout")
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(config.SCALES)}")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1)
+    options = parser.parse_args()
+    split = home_folders(options.out, config.scale(options.scale).scenes)
+    folders = [*split.train, *split.validation, *split.test]
+    ensure_homes(folders, options.seed, options.workers)
+    write_dataset_config(options.out, folders)
+
+
+if __name__ == "__main__":
+    run_command(main)
