@@ -1,0 +1,64 @@
+"""Object names of HM3DSem to the eight evaluated classes."""
+
+import re
+
+from zerobev.config import LABELS, NO_LABEL
+
+#: The noun that a name ends with decides its class; annotators' misspellings are among the nouns.
+_NOUNS = {
+    "wall": "wall wal walll baseboard molding niche paneling relief",
+    "floor": "floor floer florr floormat mat bathmat doormat rug carpet cerpet gravel landing lawn pavement paving",
+    "chair": "chair chairs cair chiar armchair aemchair armchir highchair highchairs recliner beanbag chaise",
+    "sofa": "sofa couch",
+    "bed": "bed bedframe bedpost headboard mattress hammock cradle",
+    "plant": "plant plants flower flowers tree grass vegetation",
+    "toilet": "toilet tailet toiled toilete toliet tolilet bidet",
+    "tv": "tv monitor whiteboard",
+}
+
+#: Whole names that belong to a class although their last noun does not.
+_ALSO = {
+    "wall": "skirting board, tool board, tool rack, wall balk, wall balks, wall coping, wall corridor, wall of green, "
+    "wall outside, wall panel, wall panel frame, wallkitchen island",
+    "floor": "floor frame, foor frame",
+    "sofa": "chaise longue, sofa set",
+    "bed": "bed base, bed frame, bed sheet",
+    "plant": "twigs in vase, unknown/ probably decorative plant",
+    "toilet": "cat litter box, chamber pot, toilet seat",
+    "tv": "bulletin board, display, tube, tv led, unknown/ probably home theater player",
+}
+
+#: Whole names that belong to no class although they end with one of the nouns.
+_NEITHER = (
+    "bath wall, ceiling molding, ceiling wall, closet mirror wall, compound wall, fireplace wall, recessed wall, "
+    "shower wall, stair wall, wall niche, closet floor, fireplace floor, patio floor, shower floor, excercise mat, "
+    "exercise mat, joga mat, place mat, training mat, yoga mat, rolled carpet, baby chair, row of theater chairs, "
+    "pet bed, bonsai tree, cat tree, christmas tree, decoration plant, decorative plant, decorative plants, "
+    "decoratrive plant, dried flowers, led tv, wall tv"
+)
+
+_LABEL_OF_NOUN = {noun: LABELS.index(label) for label, nouns in _NOUNS.items() for noun in nouns.split()}
+_LABEL_OF_NAME = {name: LABELS.index(label) for label, names in _ALSO.items() for name in names.split(", ")}
+_LABEL_OF_NAME |= dict.fromkeys(_NEITHER.split(", "), NO_LABEL)
+
+
+def label_of(name: str) -> int:
+    """Index into `config.LABELS` of an object called `name`, or `NO_LABEL`; case and runs of spaces do not matter.
+
+    Names are the free text of HM3DSem's annotators. All 1,624 of release 0.2 get the class that habitat-sim's
+    table gives them by way of Matterport3D's forty categories; other names follow the same rule, which is:
+    a whole name on one of two short lists of irregular ones, else the noun at its end ("office chair" is a
+    chair, "chair stand" is not). "unknown/ probably" in front and notes such as "/outside" behind are ignored.
+
+    Choices that this makes: armchairs, recliners and beanbags are chairs; stools, ottomans, benches and plain
+    seats are not; rugs, carpets and most mats are floor; monitors and whiteboards are tv; bidets are toilets;
+    baseboards are wall; "decorative plant" and vases are not plants, "plant" and "flowers" are.
+    """
+    tidy = " ".join(name.lower().split())
+    if tidy in _LABEL_OF_NAME:
+        return _LABEL_OF_NAME[tidy]
+    tidy = re.sub(r"^unknown ?/ ?(probably )?", "", tidy)
+    tidy = tidy.split("/")[0].strip()
+    if tidy in _LABEL_OF_NAME:
+        return _LABEL_OF_NAME[tidy]
+    return _LABEL_OF_NOUN.get(tidy.rpartition(" ")[2], NO_LABEL)

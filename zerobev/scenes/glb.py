@@ -1,0 +1,211 @@
+"""GLB files: what trimesh leaves out when it reads or writes them.
+
+trimesh reads geometry, node transforms and images. It drops material extensions, and it turns v upwards with a
+rounding error, so `read_glb` returns the header too and hands UV coordinates through untouched under a second
+name. Writing is our own: trimesh's exporter has no samplers, no 16-bit colours and no choice of JPEG quality.
+"""
+
+import io
+import json
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from zerobev.errors import InputError
+
+#: Vertex attribute with UV coordinates as they stand in the file; trimesh leaves names with an underscore alone.
+RAW_UV = "_TEXCOORD_0"
+
+_MAGIC, _VERSION = b"glTF", 2
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_NEAREST_CLAMPED = {"magFilter": 9728, "minFilter": 9728, "wrapS": 33071, "wrapT": 33071}
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """Triangles of one material, as a GLB file stores them."""
+
+    name: str
+    positions: np.ndarray  #: (V, 3) float32, metres
+    faces: np.ndarray  #: (F, 3) integers
+    uv: np.ndarray | None = None  #: (V, 2) float32, v down
+    colors: np.ndarray | None = None  #: (V, 4) uint16, linear
+    image: bytes | None = None  #: a PNG or JPEG file; written once for primitives that share the object
+    base_color: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: linear RGBA, multiplied with the image
+    unlit: bool = False
+    double_sided: bool = False
+
+
+def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
+    """The JSON header of the GLB file at `path`, and its content as trimesh reads it.
+
+    Geometries are in the file's order. Their UV coordinates are also in `vertex_attributes[RAW_UV]`, v down and
+    exactly as stored. Images are opened, not decoded. A file that is missing, cut short, no GLB 2, without
+    triangles, not finite, or with images that PIL cannot open, is an `InputError`.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: expected a GLB file, found {error.strerror}") from error
+    header, end = _header(path, content)
+    try:
+        _check_images(path, header, content[end + 8 :])
+        for mesh in header.get("meshes", []):
+            for primitive in mesh["primitives"]:
+                if "TEXCOORD_0" in primitive["attributes"]:
+                    primitive["attributes"][RAW_UV] = primitive["attributes"]["TEXCOORD_0"]
+        loaded = trimesh.load_scene(io.BytesIO(_container(header, content[end:])), file_type="glb", process=False)
+        meshes = list(placed_meshes(loaded))
+        complete = all(len(faces) == 0 or faces.max() < len(vertices) for _, vertices, faces in meshes)
+        finite = all(np.isfinite(vertices).all() for _, vertices, _ in meshes)
+    except InputError:
+        raise
+    except Exception as error:  # trimesh has no error of its own for a broken file
+        found = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"{path}: expected a readable GLB file, found {found}") from error
+    if sum(len(faces) for _, _, faces in meshes) == 0:
+        raise InputError(f"{path}: expected a mesh, found no triangles")
+    if not finite or not complete:
+        found = "a vertex that is not" if not finite else "a face with a vertex that does not exist"
+        raise InputError(f"{path}: expected finite vertices and faces between them, found {found}")
+    return header, loaded
+
+
+def placed_meshes(scene: trimesh.Scene) -> Iterator[tuple[trimesh.Trimesh, np.ndarray, np.ndarray]]:
+    """Each mesh of `scene`, its vertices ((V, 3) float32, world) and faces ((F, 3)); in the order of the geometries."""
+    order = {name: index for index, name in enumerate(scene.geometry)}
+    placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    for world_T_mesh, name in sorted(placed, key=lambda place: order[place[1]]):
+        mesh = scene.geometry[name]
+        if not isinstance(mesh, trimesh.Trimesh):
+            continue
+        vertices, faces = mesh.vertices.view(np.ndarray), mesh.faces.view(np.ndarray)
+        if not np.array_equal(world_T_mesh, np.eye(4)):
+            vertices = trimesh.transform_points(vertices, world_T_mesh)
+            if np.linalg.det(world_T_mesh[:3, :3]) < 0:  # a mirrored mesh keeps its front faces
+                faces = faces[:, ::-1]
+        yield mesh, vertices.astype(np.float32), faces
+
+
+def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> None:
+    """Write `primitives` as a GLB 2 file, a mesh and a node each. Same input, same bytes.
+
+    `nearest` asks for nearest, clamped sampling of the images; else the file says nothing, which is linear and
+    repeating.
+    """
+    header: dict[str, Any] = {"asset": {"version": "2.0", "generator": "zerobev"}, "scene": 0}
+    for key in ("nodes", "meshes", "materials", "accessors", "bufferViews", "images", "textures"):
+        header[key] = []
+    header["scenes"] = [{"nodes": list(range(len(primitives)))}]
+    if nearest:
+        header["samplers"] = [_NEAREST_CLAMPED]
+    if any(primitive.unlit for primitive in primitives):
+        header["extensionsUsed"] = ["KHR_materials_unlit"]
+    binary = bytearray()
+    texture_of: dict[int, int] = {}  # by identity: charts that happen to look the same remain two
+    for index, primitive in enumerate(primitives):
+        attributes = {"POSITION": _add_array(header, binary, primitive.positions, _FLOAT, bounds=True)}
+        if primitive.uv is not None:
+            attributes["TEXCOORD_0"] = _add_array(header, binary, primitive.uv, _FLOAT)
+        if primitive.colors is not None:
+            attributes["COLOR_0"] = _add_array(header, binary, primitive.colors, _UINT16)
+        indices = _add_array(header, binary, primitive.faces.reshape(-1), _UINT32)
+        triangles = {"attributes": attributes, "indices": indices, "mode": 4}
+        header["meshes"].append({"name": primitive.name, "primitives": [triangles]})
+        header["nodes"].append({"name": primitive.name, "mesh": index})
+        if primitive.colors is not None and primitive.image is None:
+            continue  # readers (trimesh is one) take the white of a material for the colour
+        texture = None
+        if primitive.image is not None:
+            if id(primitive.image) not in texture_of:
+                texture_of[id(primitive.image)] = _add_image(header, binary, primitive.image, nearest)
+            texture = texture_of[id(primitive.image)]
+        triangles["material"] = len(header["materials"])
+        header["materials"].append(_material(primitive, texture))
+    header["buffers"] = [{"byteLength": len(binary)}]
+    used = {key: value for key, value in header.items() if value != []}
+    Path(path).write_bytes(_container(used, struct.pack("<II", len(binary), _BINARY) + binary))
+
+
+def _header(path: Path, content: bytes) -> tuple[dict[str, Any], int]:
+    """The JSON chunk, and where it ends; every length in the file is checked against the file's own."""
+    if len(content) < 20 or content[:4] != _MAGIC:
+        raise InputError(f"{path}: expected a GLB file, found {len(content)} bytes that start with {content[:4]!r}")
+    version, length, size, kind = struct.unpack_from("<IIII", content, 4)
+    if version != _VERSION or kind != _JSON:
+        raise InputError(f"{path}: expected GLB version 2 with a JSON header, found version {version}")
+    if length != len(content):
+        raise InputError(f"{path}: expected {length} bytes, as its header says, found {len(content)}")
+    try:
+        header = json.loads(content[20 : 20 + size])
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected a JSON header, found {error}") from error
+    if not isinstance(header, dict):
+        raise InputError(f"{path}: expected a JSON object as header, found {type(header).__name__}")
+    return header, 20 + size
+
+
+def _check_images(path: Path, header: dict[str, Any], binary: bytes) -> None:
+    """trimesh passes over an image that it cannot open; here that is an error."""
+    for index, image in enumerate(header.get("images", [])):
+        view = header["bufferViews"][image["bufferView"]]
+        start = view.get("byteOffset", 0)
+        try:
+            Image.open(io.BytesIO(binary[start : start + view["byteLength"]]))
+        except OSError as error:
+            kind = image.get("mimeType", "a file of no type")
+            raise InputError(f"{path}: expected a readable PNG or JPEG as image {index}, found {kind}") from error
+
+
+def _container(header: dict[str, Any], rest: bytes) -> bytes:
+    """A GLB file of a JSON header and the chunks after it."""
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIIII", _MAGIC, _VERSION, 20 + len(text) + len(rest), len(text), _JSON) + text + rest
+
+
+def _material(primitive: Primitive, texture: int | None) -> dict[str, Any]:
+    surface: dict[str, Any] = {"baseColorFactor": list(primitive.base_color), "metallicFactor": 0.0}
+    surface["roughnessFactor"] = 1.0
+    if texture is not None:
+        surface["baseColorTexture"] = {"index": texture}
+    material = {"name": primitive.name, "pbrMetallicRoughness": surface, "doubleSided": primitive.double_sided}
+    if primitive.unlit:
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    return material
+
+
+def _add_view(header: dict[str, Any], binary: bytearray, content: bytes) -> int:
+    header["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(content)})
+    binary += content + bytes(-len(content) % 4)
+    return len(header["bufferViews"]) - 1
+
+
+def _add_array(header: dict[str, Any], binary: bytearray, array: np.ndarray, kind: int, bounds: bool = False) -> int:
+    """Index of a new accessor of `array`, stored as `kind`; positions need their bounds."""
+    stored = array.astype({_FLOAT: "<f4", _UINT16: "<u2", _UINT32: "<u4"}[kind])
+    form = "SCALAR" if stored.ndim == 1 else f"VEC{stored.shape[1]}"
+    view = _add_view(header, binary, stored.tobytes())
+    accessor = {"bufferView": view, "componentType": kind, "count": len(stored), "type": form}
+    if kind == _UINT16:
+        accessor["normalized"] = True
+    if bounds:
+        accessor |= {"min": stored.min(axis=0).tolist(), "max": stored.max(axis=0).tolist()}
+    header["accessors"].append(accessor)
+    return len(header["accessors"]) - 1
+
+
+def _add_image(header: dict[str, Any], binary: bytearray, image: bytes, nearest: bool) -> int:
+    """Index of a new texture of `image`, an encoded file."""
+    kind = "image/png" if image.startswith(b"\x89PNG") else "image/jpeg"
+    header["images"].append({"bufferView": _add_view(header, binary, image), "mimeType": kind})
+    sampled = {"sampler": 0} if nearest else {}
+    header["textures"].append({"source": len(header["images"]) - 1} | sampled)
+    return len(header["textures"]) - 1

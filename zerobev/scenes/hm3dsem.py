@@ -1,0 +1,205 @@
+"""Homes in the format of HM3DSem v0.2: which there are, how they are split, and one of them as a `Scene`.
+
+A dataset is a folder with `train`, `val` and perhaps `minival`; a scene is a folder `NNNNN-HASH` in one of
+them, with `HASH.glb` (the photograph), `HASH.semantic.glb` (the annotation) and `HASH.semantic.txt` (the names).
+Variants with Basis textures are ignored. `hm3dsem_writer` writes the same.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from zerobev.errors import InputError
+from zerobev.scenes.categories import label_of
+from zerobev.scenes.glb import RAW_UV, placed_meshes, read_glb
+from zerobev.scenes.scene import Instance, Scene
+
+FIRST_LINE = "HM3D Semantic Annotations"
+_SPLITS = ("train", "val", "minival")
+_MINIVAL = ("00800", "00802", "00803", "00808")
+_ROW = re.compile(r'([0-9]{1,5}),([0-9A-Fa-f]{6}),"(.*)",(-?[0-9]{1,9})')
+_ROW_FORM = 'id,RRGGBB,"name",region'
+_LARGEST_ID = 65535
+
+
+@dataclass(frozen=True)
+class Split:
+    """Folders of the scenes for training, validation and test; each sorted by name."""
+
+    train: tuple[Path, ...]
+    validation: tuple[Path, ...]
+    test: tuple[Path, ...]
+    dealt: bool = False  #: not the official split: there were too few homes for it
+
+
+def hash_of(folder: Path) -> str:
+    """The part of a scene folder's name that its files are called by; a name of another form is an `InputError`."""
+    match = re.fullmatch(r"[0-9]{5}-(\w+)", Path(folder).name)
+    if match is None:
+        raise InputError(f"{folder}: expected a scene folder named NNNNN-HASH, found {Path(folder).name!r}")
+    return match[1]
+
+
+def find_scenes(root: Path) -> dict[str, list[Path]]:
+    """The annotated scene folders in `train`, `val` and `minival` of `root`, sorted by name; lists may be empty.
+
+    A scene is annotated if it has both semantic files. None at all is an `InputError`.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise InputError(f"{root}: expected a dataset folder, found {'a file' if root.exists() else 'nothing'}")
+    folders = {split: sorted((root / split).glob("[0-9]*-*")) for split in _SPLITS}
+    found = {split: [folder for folder in folders[split] if _is_annotated(folder)] for split in _SPLITS}
+    if not any(found.values()):
+        count = sum(map(len, folders.values()))
+        expected = "train, val or minival with scenes NNNNN-HASH that have .semantic.glb and .semantic.txt"
+        raise InputError(f"{root}: expected {expected}, found {count} scene folders, none of them annotated")
+    return found
+
+
+def split_scenes(root: Path) -> Split:
+    """Split the scenes of `root` as the paper does, or deal them out where that is not possible.
+
+    The paper's split (section "Experimental Results"): training on `train`; validation on the four annotated
+    scenes of `minival` (taken from `val` where there is no such folder); test on the rest of `val`.
+
+    Where one of the three would be empty all scenes are dealt out, sorted by name: of n scenes the last
+    max(1, n // 5) are for test, the one before them for validation, and the others for training. With two
+    scenes the training home serves validation too, by its own other views. One scene is an `InputError`.
+    """
+    found = find_scenes(root)
+    validation = found["minival"] or [folder for folder in found["val"] if folder.name[:5] in _MINIVAL]
+    names = {folder.name for folder in validation}
+    test = [folder for folder in found["val"] if folder.name not in names]
+    if found["train"] and validation and test:
+        return Split(tuple(found["train"]), tuple(validation), tuple(test), dealt=False)
+    by_name = {folder.name: folder for split in _SPLITS for folder in found[split]}
+    scenes = tuple(by_name[name] for name in sorted(by_name))
+    if len(scenes) < 2:
+        raise InputError(f"{root}: expected two annotated scenes at least, for training and for test, found one")
+    tests = max(1, len(scenes) // 5)
+    if len(scenes) == 2:
+        return Split(scenes[:1], scenes[:1], scenes[1:], dealt=True)
+    return Split(scenes[: -tests - 1], scenes[-tests - 1 : -tests], scenes[-tests:], dealt=True)
+
+
+def read_scene(folder: Path) -> Scene:
+    """The scene in `folder`, named after it.
+
+    Faces keep the file's order; charts are in the order of their first face. Texels whose colour belongs to no
+    instance get id 0. UV coordinates are clamped to [0, 1]. A mesh of the annotation without a texture is an
+    `InputError` (textures for the surface need the atlas), and so is every broken or missing file.
+    """
+    folder = Path(folder)
+    stem = hash_of(folder)
+    instances = read_instances(folder / f"{stem}.semantic.txt")
+    path = folder / f"{stem}.semantic.glb"
+    header, annotation = read_glb(path)
+    double_sided = any(material.get("doubleSided", False) for material in header.get("materials", []))
+    atlas = _read_atlas(path, annotation, instances)
+    photograph_path = folder / f"{stem}.glb"
+    photograph_header, photograph = read_glb(photograph_path)
+    unlit = any("KHR_materials_unlit" in m.get("extensions", {}) for m in photograph_header.get("materials", []))
+    for mesh in photograph.geometry.values():
+        image = _texture(mesh)
+        if image is not None:
+            _decode(photograph_path, image)
+    return Scene(
+        name=folder.name, **atlas, instances=instances, photograph=photograph, unlit=unlit, double_sided=double_sided
+    )
+
+
+def read_instances(path: Path) -> tuple[Instance, ...]:
+    """The rows of a `.semantic.txt`, sorted by id, with the labels of their names.
+
+    The form is a first line `HM3D Semantic Annotations`, then `id,RRGGBB,"name",region` in each line; a name may
+    hold commas and quotes. Ids are 1 to 65535; ids and colours are unique, and black is "unknown". All else is
+    an `InputError` with the file, the line and what stands there.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
+    except OSError as error:
+        raise InputError(f"{path}: expected a list of instances, found {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected UTF-8 text, found byte {error.object[error.start]:#04x}") from error
+    if lines[0].rstrip() != FIRST_LINE:
+        raise InputError(f"{path}, line 1: expected {FIRST_LINE!r}, found {lines[0][:80]!r}")
+    instances: dict[int, Instance] = {}
+    colors = {(0, 0, 0)}
+    for number, line in enumerate(lines[1:], start=2):
+        row = line.strip()
+        if not row:
+            continue
+        match = _ROW.fullmatch(row)
+        if match is None or not 1 <= int(match[1]) <= _LARGEST_ID:
+            expected = f"{_ROW_FORM} with an id from 1 to {_LARGEST_ID}"
+            raise InputError(f"{path}, line {number}: expected {expected}, found {row[:80]!r}")
+        color = tuple(bytes.fromhex(match[2]))
+        instance = Instance(int(match[1]), color, match[3], int(match[4]), label_of(match[3]))
+        if instance.id in instances or color in colors:
+            raise InputError(f"{path}, line {number}: expected an id and a color not used before, found {row[:80]!r}")
+        colors.add(color)
+        instances[instance.id] = instance
+    return tuple(instances[key] for key in sorted(instances))
+
+
+def _is_annotated(folder: Path) -> bool:
+    stem = folder.name.partition("-")[2]
+    return all((folder / f"{stem}.semantic.{kind}").is_file() for kind in ("glb", "txt"))
+
+
+def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance, ...]) -> dict:
+    """The fields of a `Scene` that come from the annotation's mesh and textures."""
+    id_of_color = np.zeros(1 << 24, np.uint16)
+    for instance in instances:
+        red, green, blue = instance.color
+        id_of_color[red | green << 8 | blue << 16] = instance.id
+    vertices, faces, face_uv, face_chart = [], [], [], []
+    charts: list[np.ndarray] = []
+    chart_of_image: dict[int, int] = {}
+    count = 0
+    for mesh, positions, triangles in placed_meshes(annotation):
+        image = _texture(mesh)
+        uv = mesh.vertex_attributes.get(RAW_UV)
+        if image is None or uv is None:
+            raise InputError(f"{path}: expected a texture and UV coordinates on every mesh, found one without")
+        if not np.isfinite(uv).all():
+            raise InputError(f"{path}: expected finite UV coordinates, found one that is not")
+        if id(image) not in chart_of_image:
+            chart_of_image[id(image)] = len(charts)
+            charts.append(id_of_color[_color_codes(_decode(path, image))])
+        vertices.append(positions)
+        faces.append((triangles + count).astype(np.int32))
+        face_uv.append(np.clip(uv, 0, 1).astype(np.float32)[triangles])
+        face_chart.append(np.full(len(triangles), chart_of_image[id(image)], np.int16))
+        count += len(positions)
+    return {
+        "vertices": np.concatenate(vertices),
+        "faces": np.concatenate(faces),
+        "face_uv": np.concatenate(face_uv),
+        "face_chart": np.concatenate(face_chart),
+        "chart_instance": tuple(charts),
+    }
+
+
+def _texture(mesh: trimesh.Geometry) -> Image.Image | None:
+    return getattr(getattr(getattr(mesh, "visual", None), "material", None), "baseColorTexture", None)
+
+
+def _decode(path: Path, image: Image.Image) -> Image.Image:
+    try:
+        image.load()
+    except Exception as error:  # PIL raises OSError, SyntaxError, ValueError, ... for a broken image
+        raise InputError(f"{path}: expected readable textures, found one that is not: {error}") from error
+    return image
+
+
+def _color_codes(image: Image.Image) -> np.ndarray:
+    """(rows, columns) uint32: red, green and blue bytes as one number, red lowest."""
+    pixels = np.asarray(image.convert("RGBA"))
+    return pixels.view("<u4")[..., 0] & 0xFFFFFF
