@@ -1,0 +1,1 @@
+"""Losses, training, evaluation and metrics."""

@@ -1,0 +1,348 @@
+"""One training loop for every learned model, on a CPU or on GPUs (paper, "Implementation and training details").
+
+A step is a pure function of the state before it and of (seed, step): batches are drawn by their step, and
+torch's generator is seeded anew for every step. A run that is killed and started again therefore ends with
+the very weights of an unbroken one.
+"""
+
+import json
+import logging
+import pickle
+import sys
+import time
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from accelerate import Accelerator
+from safetensors.torch import save_model
+from torch import Tensor, nn
+from torch.optim import Optimizer, lr_scheduler
+from tqdm import tqdm
+
+from zerobev.config import TrainConfig
+from zerobev.errors import InputError
+from zerobev.learning.losses import Losses, zero_bev_loss
+from zerobev.storage import replacing
+
+CHECKPOINT_SECONDS = 60  #: between two checkpoints, beside those at validations
+HISTORY_ENTRIES = 1000  #: about as many are kept of a run, beside those at validations
+
+Batch = Mapping[str, Tensor]
+Objective = Callable[[nn.Module, Batch], Losses]
+log = logging.getLogger("zerobev.train")
+
+
+class Source(Protocol):
+    """Training data without an end, addressed by step."""
+
+    def batch(self, step: int, rank: int, ranks: int) -> Batch:
+        """The share of process `rank` of `ranks` in the batch of `step`.
+
+        The batch holds the samples `step * n ... (step + 1) * n - 1`, n = `TrainConfig.batch`; a process gets every
+        `ranks`-th of them, from `rank` on. Depends on nothing else, is called from another thread, and does not
+        touch torch's global generator.
+        """
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the history; losses are means since the entry before."""
+
+    step: int  #: steps done
+    loss: float
+    main: float  #: loss of the evaluated output (the zero-shot stream)
+    aux: float | None
+    learning_rate: float  #: of the last step
+    seconds: float  #: of training so far, without those lost to an interruption
+    validation: float | None  #: score of the model after this step, where it was validated
+
+
+@dataclass(frozen=True)
+class History:
+    """What a finished run tells of itself."""
+
+    entries: tuple[Entry, ...]
+    best_step: int  #: whose weights were kept
+    best_score: float
+    seconds: float
+
+
+class Schedule:
+    """The learning rate: linear warm-up, exponential decay, and halving on a plateau of the validation score.
+
+    Three factors on the configured rate. Step t < `warmup` has the factor (t + 1) / warmup; every `decay_every`
+    steps multiply by `decay`; and the first validation after `patience` of them without progress (a
+    score at least 0.01 % lower) halves the rate, as in torch's `ReduceLROnPlateau`.
+    """
+
+    def __init__(self, optimizer: Optimizer, config: TrainConfig) -> None:
+        self._steps = [lr_scheduler.StepLR(optimizer, config.decay_every, config.decay)]
+        if config.warmup > 1:
+            self._steps.append(lr_scheduler.LinearLR(optimizer, 1 / config.warmup, total_iters=config.warmup - 1))
+        self._plateau = lr_scheduler.ReduceLROnPlateau(optimizer, factor=0.5, patience=config.patience)
+
+    def step(self) -> None:
+        """To be called after every step of the optimiser."""
+        for scheduler in self._steps:
+            scheduler.step()
+
+    def validated(self, score: float) -> None:
+        """To be called after every validation; lower is better."""
+        self._plateau.step(score)
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        """State of the three factors; the rate itself is part of the optimiser's state."""
+        return [scheduler.state_dict() for scheduler in (*self._steps, self._plateau)]
+
+    def load_state_dict(self, states: list[dict[str, Any]]) -> None:
+        """The inverse of `state_dict`."""
+        for scheduler, state in zip((*self._steps, self._plateau), states, strict=True):
+            scheduler.load_state_dict(state)
+
+
+def dice_objective(alpha: float) -> Objective:
+    """The Zero-BEV loss of a model that is called as `model(rgb, zero)` and returns a `Projection`."""
+    return lambda model, batch: zero_bev_loss(model(batch["rgb"], batch["zero"]), batch, alpha)
+
+
+def train(
+    model: nn.Module,
+    data: Source,
+    validation: Sequence[Batch],
+    config: TrainConfig,
+    folder: Path,
+    seed: int,
+    *,
+    key: str,
+    objective: Objective | None = None,
+    device: torch.device | str | None = None,
+) -> History:
+    """Train `model` in place; it is left on the device, in evaluation mode, with the weights that validated best.
+
+    model: with its first weights, which the caller draws from the seed
+    validation: fixed batches. Their mean `main` loss is the score, lower is better: for Zero-BEV the Dice loss of
+        the zero-shot stream. Unlike an IoU it has no threshold, so that it moves early in training already,
+        and on *Synth* textures it needs no semantic label: the choice of weights stays zero-shot.
+    folder: receives `checkpoint.pt`, `best.safetensors` (at the end), `history.jsonl` and `train.log`
+    seed: of dropout; `data` has its own
+    key: names the run. A checkpoint with this key is taken up, one with another is an `InputError`, and one that
+        cannot be read is reported in the log and replaced.
+    objective: losses of a batch; by default `dice_objective(config.alpha)`
+    device: default: a GPU if there is one. Forward passes are bfloat16 where the processor computes in it.
+    """
+    accelerator = _accelerator(device)
+    objective = objective or dice_objective(config.alpha)
+    quiet = not (accelerator.is_main_process and sys.stderr.isatty())
+    forked = [accelerator.device] if accelerator.device.type == "cuda" else []
+    with torch.random.fork_rng(forked), _logged(folder / "train.log", accelerator.is_main_process):
+        run = _Run(model, config, folder, key, accelerator)
+        try:
+            run.resume()
+            with closing(_prefetched(data, run.step, config.steps, accelerator)) as batches:
+                for batch in tqdm(batches, initial=run.step, total=config.steps, disable=quiet):
+                    torch.manual_seed(_step_seed(seed, run.step, accelerator.process_index))
+                    run.advance(objective, batch)
+                    if run.step % config.validate_every == 0 or run.step == config.steps:
+                        run.validate(objective, validation)
+                    elif run.step % -(-config.steps // HISTORY_ENTRIES) == 0:
+                        run.record(None)
+                    run.checkpoint_if_due()
+            return run.finish()
+        finally:
+            accelerator.unwrap_model(run.model, keep_fp32_wrapper=False)
+            vars(model).pop("forward", None)  # unwrapping leaves the method on the instance
+
+
+class _Run:
+    """Everything that changes during training, and its way to the disk and back."""
+
+    def __init__(self, model: nn.Module, config: TrainConfig, folder: Path, key: str, accelerator: Accelerator) -> None:
+        self.bare = model
+        self.config, self.folder, self.key, self.accelerator = config, folder, key, accelerator
+        optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
+        self.schedule = Schedule(optimizer, config)
+        self.model, self.optimizer = accelerator.prepare(model, optimizer)
+        self.step = 0
+        self.best: dict[str, Tensor] = {}
+        self.best_step, self.best_score = 0, float("inf")
+        self.entries: list[Entry] = []
+        self.window: list[list[float]] = []  # losses since the last entry
+        self.learning_rate = config.learning_rate  # of the last step
+        self._seconds_before, self._started = 0.0, time.monotonic()
+        self._saved_at = self._started
+
+    @property
+    def seconds(self) -> float:
+        return self._seconds_before + time.monotonic() - self._started
+
+    def advance(self, objective: Objective, batch: Batch) -> None:
+        """One step of the optimiser."""
+        self.model.train()
+        self.learning_rate = self.optimizer.param_groups[0]["lr"]
+        losses = objective(self.model, batch)
+        self.accelerator.backward(losses.total)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.schedule.step()
+        self.step += 1
+        values = [float(value.detach()) for value in losses if value is not None]
+        if not np.isfinite(values).all():
+            raise FloatingPointError(f"step {self.step}: expected finite losses, found {values}")
+        self.window.append(values)
+
+    def validate(self, objective: Objective, batches: Sequence[Batch]) -> None:
+        """Score the model, keep it if it is the best so far, and save a checkpoint."""
+        self.model.eval()
+        rank, ranks = self.accelerator.process_index, self.accelerator.num_processes
+        with torch.no_grad():
+            scores = [
+                float(
+                    objective(self.model, _moved({k: v[rank::ranks] for k, v in batch.items()}, self.accelerator)).main
+                )
+                for batch in batches
+            ]
+        score = float(np.mean(scores))
+        self.schedule.validated(score)
+        if score < self.best_score:
+            self.best = {name: value.detach().cpu().clone() for name, value in self.bare.state_dict().items()}
+            self.best_step, self.best_score = self.step, score
+        self.record(score)
+        self.save()
+
+    def record(self, score: float | None) -> None:
+        """Add an entry to the history, its file and the log."""
+        total, main, *aux = np.mean(self.window, axis=0).tolist()
+        entry = Entry(self.step, total, main, aux[0] if aux else None, self.learning_rate, self.seconds, score)
+        self.window.clear()
+        self.entries.append(entry)
+        if self.accelerator.is_main_process:
+            with (self.folder / "history.jsonl").open("a") as file:
+                file.write(json.dumps(asdict(entry)) + "\n")
+        validated = "" if score is None else f", validation {score:.4f} (best {self.best_score:.4f})"
+        log.info("step %d of %d, %.0f s: loss %.4f%s", self.step, self.config.steps, self.seconds, total, validated)
+
+    def checkpoint_if_due(self) -> None:
+        """Save when the last checkpoint is old."""
+        if time.monotonic() - self._saved_at > CHECKPOINT_SECONDS:
+            self.save()
+
+    def save(self) -> None:
+        """Write the checkpoint, whole or not at all."""
+        self._saved_at = time.monotonic()
+        if not self.accelerator.is_main_process:
+            return
+        state = {
+            "key": self.key,
+            "step": self.step,
+            "model": self.bare.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
+            "best": self.best,
+            "best_step": self.best_step,
+            "best_score": self.best_score,
+            "entries": [asdict(entry) for entry in self.entries],
+            "window": self.window,
+            "seconds": self.seconds,
+        }
+        with replacing(self.folder / "checkpoint.pt") as temporary:
+            torch.save(state, temporary)
+
+    def resume(self) -> None:
+        """Take up the folder's checkpoint if there is one, and begin the history's file."""
+        state = _read_checkpoint(self.folder / "checkpoint.pt", self.key)
+        if state is not None:
+            self.bare.load_state_dict(state["model"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.schedule.load_state_dict(state["schedule"])
+            self.step, self.best, self.window = state["step"], state["best"], state["window"]
+            self.best_step, self.best_score = state["best_step"], state["best_score"]
+            self.entries = [Entry(**entry) for entry in state["entries"]]
+            self._seconds_before = state["seconds"]
+            log.info("resumed at step %d", self.step)
+        if self.accelerator.is_main_process:
+            with replacing(self.folder / "history.jsonl") as temporary:
+                temporary.write_text("".join(json.dumps(asdict(entry)) + "\n" for entry in self.entries))
+
+    def finish(self) -> History:
+        """Load the best weights and write them."""
+        self.bare.load_state_dict(self.best)
+        self.bare.eval()
+        if self.accelerator.is_main_process:
+            with replacing(self.folder / "best.safetensors") as temporary:
+                save_model(self.bare, str(temporary))
+        return History(tuple(self.entries), self.best_step, self.best_score, self.entries[-1].seconds)
+
+
+def _read_checkpoint(path: Path, key: str) -> dict[str, Any] | None:
+    """The checkpoint, or None if there is none that can be read."""
+    if not path.exists():
+        return None
+    try:
+        with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums
+            damaged = archive.testzip()
+        if damaged:
+            raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        found = state["key"]
+    except (zipfile.BadZipFile, RuntimeError, OSError, KeyError, TypeError, pickle.UnpicklingError) as error:
+        log.warning("%s cannot be read (%r): training starts from the first step", path, error)
+        return None
+    if found != key:
+        raise InputError(f"{path}: expected a checkpoint of the run {key!r}, found one of {found!r}")
+    return state
+
+
+def _prefetched(data: Source, first: int, steps: int, accelerator: Accelerator) -> Iterator[Batch]:
+    """Batches of the steps `first` to `steps - 1`; each is made in a second thread during the step before it."""
+    place = accelerator.process_index, accelerator.num_processes
+    with ThreadPoolExecutor(max_workers=1) as executor:
+        ahead = (executor.submit(data.batch, step, *place) for step in range(first, steps))
+        coming = next(ahead, None)
+        while coming is not None:
+            batch = coming.result()
+            coming = next(ahead, None)
+            yield _moved(batch, accelerator)
+
+
+def _moved(batch: Batch, accelerator: Accelerator) -> Batch:
+    return {name: value.to(accelerator.device, non_blocking=True) for name, value in batch.items()}
+
+
+def _step_seed(seed: int, step: int, rank: int) -> int:
+    return int(np.random.SeedSequence([seed, step, rank]).generate_state(1, np.uint64)[0])
+
+
+def _accelerator(device: torch.device | str | None) -> Accelerator:
+    """Accelerate's choice of device, held against the wish, in bfloat16 where the hardware has it."""
+    wish = None if device is None else torch.device(device).type
+    on_gpu = torch.cuda.is_available() and wish != "cpu"
+    capable = torch.cpu.get_capabilities()
+    bf16 = torch.cuda.is_bf16_supported() if on_gpu else capable.get("avx512_bf16") or capable.get("amx_bf16")
+    accelerator = Accelerator(cpu=not on_gpu, mixed_precision="bf16" if bf16 else "no")
+    if wish not in (None, accelerator.device.type):
+        raise InputError(f"device: expected {accelerator.device.type}, the one at hand, found {wish}")
+    return accelerator
+
+
+@contextmanager
+def _logged(path: Path, main: bool) -> Iterator[None]:
+    """Send the log of the main process to `path`, too."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handler = logging.FileHandler(path) if main else logging.NullHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    level = log.level
+    log.setLevel(logging.INFO)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+        handler.close()
