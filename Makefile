@@ -1,0 +1,114 @@
+# zerobev: set-up, tests and the workbook. `make help` lists the targets.
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+SCALE ?= reduced
+SCENES ?=
+TEXTURES ?=
+FRESH ?=
+export SCALE SCENES TEXTURES
+
+PYTHON := .venv/bin/python
+READY := .venv/.ready
+RENDERER := .venv/.renderer
+MESA := libegl1 libgl1 libgl1-mesa-dri
+
+# Photographs are rendered without a display; a user's own choice of platform stands.
+export PYOPENGL_PLATFORM ?= egl
+export TOKENIZERS_PARALLELISM ?= false
+# Packages come from .venv alone.
+unexport PYTHONHOME PYTHONPATH
+
+.PHONY: help setup reproduce test lab notebooks clean distclean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
+
+reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper] [SCENES=dir] [TEXTURES=dir] [FRESH=1]
+	@$(PYTHON) -m zerobev.reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
+	    $${TEXTURES:+--textures "$$TEXTURES"} $(if $(filter-out 0,$(FRESH)),--fresh)
+
+test: setup ## run the tests, then check every notebook against its committed outputs
+	@status=0
+	$(PYTHON) -m pytest tests || status=$$?
+	$(PYTHON) -m pytest --nbval notebooks || status=$$?
+	exit $$status
+
+lab: setup ## open the notebooks in JupyterLab
+	@$(PYTHON) -c "$$OPEN_LAB" notebooks $$([ "$$(id -u)" != 0 ] || echo --allow-root)
+
+define OPEN_LAB
+import os
+from jupyterlab.labapp import main
+from zerobev.reproduce import kernel_settings
+os.environ.update(kernel_settings())
+main()
+endef
+export OPEN_LAB
+
+notebooks: setup ## execute the committed notebooks again, in place
+	@$(PYTHON) -m zerobev.reproduce --in-place
+
+setup: $(RENDERER) ## install the pinned environment into .venv (the other targets do it when needed)
+
+clean: ## remove caches (shards and checkpoints too), executed notebooks and logs; records stay
+	@rm -rf .cache .pytest_cache .ruff_cache .hypothesis *.egg-info reports/*/notebooks reports/*/logs
+	find zerobev tests notebooks -depth \( -name __pycache__ -o -name .ipynb_checkpoints \) -exec rm -rf {} +
+
+distclean: clean ## as clean, and remove .venv
+	@rm -rf .venv
+
+# `.unfinished` lies in .venv from the first to the last step of a set-up: one that was killed starts from nothing.
+$(READY): environment.txt pyproject.toml
+	@if [ -e .venv/.unfinished ]; then rm -rf .venv; fi
+	if [ ! -e $(PYTHON) ]; then
+	    for python in python3.12 python3.11 python3 python; do
+	        if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+	            found=$$python
+	            break
+	        fi
+	    done
+	    if [ -z "$${found:-}" ]; then
+	        echo "error: no Python 3.11 or newer with its venv module was found (Debian: python3 and python3-venv)" >&2
+	        exit 1
+	    fi
+	    mkdir -p .venv
+	    touch .venv/.unfinished
+	    "$$found" -m venv .venv
+	fi
+	touch .venv/.unfinished
+	echo "Setting up .venv from environment.txt; this takes some minutes, once."
+	$(PYTHON) -m pip install --disable-pip-version-check -r environment.txt
+	$(PYTHON) -m pip install --disable-pip-version-check --quiet --no-deps -e .
+	touch .venv/.unfinished
+	mv .venv/.unfinished $@
+
+define OPEN_EGL
+import pyrender
+scene = pyrender.Scene()
+scene.add(pyrender.PerspectiveCamera(yfov=1.0))
+pyrender.OffscreenRenderer(8, 8).render(scene)
+endef
+export OPEN_EGL
+
+# A context is opened rather than a file looked for: only that shows that photographs can be taken here.
+$(RENDERER): $(READY)
+	@opens() { $(PYTHON) -c "$$OPEN_EGL" >/dev/null 2>&1; }
+	if ! opens; then
+	    if [ "$$(id -u)" = 0 ]; then root=; else root="sudo -n"; fi
+	    if $${root:-true} true 2>/dev/null && command -v apt-get >/dev/null; then
+	        echo "Installing $(MESA)."
+	        install="env DEBIAN_FRONTEND=noninteractive apt-get install -qq $(MESA)"
+	        $$root $$install >/dev/null 2>&1 || { $$root apt-get update -qq; $$root $$install; } >/dev/null 2>&1 || true
+	    fi
+	    if ! opens; then
+	        echo "error: EGL does not open here; install the packages $(MESA)" >&2
+	        exit 1
+	    fi
+	fi
+	touch $@
