@@ -1,0 +1,83 @@
+"""Feature extractors on the first-person side: the ResNet of the photograph and the small CNN of the zero-shot image.
+
+Paper, supplement, "Feature extractor": four maps of each image, at the same four strides, so that they can be
+concatenated. Every layer halves a size n to ceil(n / 2), so odd sizes work and both extractors agree.
+"""
+
+from itertools import pairwise
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+from transformers import ResNetBackbone, ResNetConfig
+
+from zerobev.config import ModelConfig
+from zerobev.errors import InputError
+
+
+def resnet(
+    in_channels: int,
+    stem_channels: int,
+    channels: tuple[int, ...],
+    depths: tuple[int, ...],
+    block: str = "basic",
+    max_pool: bool = True,
+) -> ResNetBackbone:
+    """A ResNet with random weights whose call gives one map a stage (`.feature_maps`, finest first).
+
+    The stem is a 7x7 convolution with stride 2; with `max_pool` a 3x3 max-pool halves the map again. The first
+    stage keeps the size, each later one halves it. Parameter names are those of the `transformers` library, so
+    that `microsoft/resnet-50` fits the paper's setting.
+    """
+    config = ResNetConfig(
+        num_channels=in_channels,
+        embedding_size=stem_channels,
+        hidden_sizes=list(channels),
+        depths=list(depths),
+        layer_type=block,
+        out_features=[f"stage{i + 1}" for i in range(len(channels))],
+    )
+    network = ResNetBackbone(config)
+    if not max_pool:
+        network.embedder.pooler = nn.Identity()
+    return network
+
+
+def rgb_backbone(model: ModelConfig) -> ResNetBackbone:
+    """The ResNet of the photograph, (B, 3, H, W) -> maps at strides `model.stem_stride` * (1, 2, 4, 8).
+
+    Raises `InputError` for a stem stride other than 2 and 4.
+    """
+    if model.stem_stride not in (2, 4):
+        raise InputError(f"stem_stride: expected 2 or 4, found {model.stem_stride}")
+    return resnet(3, model.stem_channels, model.channels, model.depths, model.block, max_pool=model.stem_stride == 4)
+
+
+class ZeroCNN(nn.Module):
+    """Bring the zero-shot image to the sizes of the backbone's maps: four 3x3 convolutions of stride 2, with ReLU.
+
+    At stem stride 2 this is the network of the paper's supplement, with maps at strides 2, 4, 8, 16. The paper also
+    states backbone maps at strides 4 to 32, which four such layers cannot reach; at stem stride 4 the image is
+    therefore first folded 2 x 2 pixels into 4 channels, which halves its size and loses nothing.
+
+    There is no normalisation: the scale of the input means something, and an empty image is a usual one.
+    """
+
+    def __init__(self, channels: tuple[int, int, int, int], stem_stride: int):
+        super().__init__()
+        self.fold = stem_stride // 2
+        widths = (self.fold**2, *channels)
+        self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
+        for layer in self.layers:
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, zero: Tensor) -> list[Tensor]:
+        """(N, 1, H, W) -> four maps (N, channels[b], ceil(H / stride_b), ceil(W / stride_b)), finest first."""
+        height, width = zero.shape[-2:]
+        padded = F.pad(zero, (0, -width % self.fold, 0, -height % self.fold))
+        features = F.pixel_unshuffle(padded, self.fold)
+        maps = []
+        for layer in self.layers:
+            features = layer(features).relu()
+            maps.append(features)
+        return maps

@@ -1,0 +1,26 @@
+"""The feature pyramid (Lin et al. 2017) that gives every stride the same width and the context of the coarser ones."""
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class FeaturePyramid(nn.Module):
+    """1x1 laterals, top-down nearest upsampling, 3x3 outputs; all maps get `width` channels, sizes stay."""
+
+    def __init__(self, channels: tuple[int, ...], width: int):
+        super().__init__()
+        self.laterals = nn.ModuleList(nn.Conv2d(c, width, 1) for c in channels)
+        self.outputs = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in channels)
+        for layer in (*self.laterals, *self.outputs):
+            nn.init.kaiming_uniform_(layer.weight, a=1)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, maps: list[Tensor]) -> list[Tensor]:
+        """Maps (N, channels[b], R_b, C_b), finest first -> (N, width, R_b, C_b); each size half the last."""
+        merged = [lateral(features) for lateral, features in zip(self.laterals, maps)]
+        for fine in range(len(merged) - 2, -1, -1):
+            rows, columns = merged[fine].shape[-2:]
+            # Doubled and cropped, not stretched: at odd sizes too, coarse pixel i stays over fine pixels 2i and 2i + 1.
+            doubled = F.interpolate(merged[fine + 1], scale_factor=2, mode="nearest")
+            merged[fine] = merged[fine] + doubled[..., :rows, :columns]
+        return [output(features) for output, features in zip(self.outputs, merged)]
