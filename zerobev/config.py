@@ -44,6 +44,18 @@ class CameraConfig:
 
 
 @dataclass(frozen=True)
+class AgentConfig:
+    """The body that carries the camera, and which of its poses are worth a view (Habitat's ObjectNav agent)."""
+
+    radius_m: float = 0.18
+    height_m: float = 1.5
+    climb_m: float = 0.2  #: geometry up to this height above the floor does not block
+    grid_m: float = 0.05  #: cell of the navigability grid
+    island_m2: float = 0.5  #: smaller patches of free floor (inside furniture, say) are not navigable
+    least_view: float = 0.10  #: share of the map that a view must see; poses that face a wall see less
+
+
+@dataclass(frozen=True)
 class TextureConfig:
     """The *Synth* textures (paper, supplement, "Synth."); one texel is 1 cm in generated homes."""
 

@@ -57,7 +57,7 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
     config = {"experiment": asdict(experiment), "data": workspace.identity, "recipe": RECIPE_VERSION}
     if experiment.method == "zero_bev":
         scale = workspace.scale
-        config |= {"model": asdict(scale.model), "train": asdict(scale.train), "texture": asdict(scale.texture)}
+        config |= {"model": asdict(scale.model), "train": asdict(scale.train), "texture": workspace.texture_identity}
     return config
 
 

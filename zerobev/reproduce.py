@@ -11,6 +11,7 @@ import fcntl
 import os
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -61,6 +62,8 @@ def kernel_settings() -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
         "PYOPENGL_PLATFORM": os.environ.get("PYOPENGL_PLATFORM", "egl"),
+        # a progress bar of Jupyter widgets is not wanted, so that it cannot be had is no news
+        "PYTHONWARNINGS": "ignore:IProgress not found",
         "TOKENIZERS_PARALLELISM": os.environ.get("TOKENIZERS_PARALLELISM", "false"),
     }
 
@@ -87,6 +90,31 @@ def only_run(logs: Path) -> Iterator[None]:
         except BlockingIOError:
             raise InputError(f"{logs}: expected no other run of this report, found one at work") from None
         yield
+
+
+@contextlib.contextmanager
+def shown_progress(file: Path) -> Iterator[None]:
+    """Let kernels write the progress of long work to `file`, and pass it on to the terminal, if there is one."""
+    file.write_text("")
+    done = threading.Event()
+    terminal = os.dup(2)
+
+    def follow() -> None:
+        with file.open("rb") as written:
+            while not done.wait(0.5):
+                os.write(terminal, written.read())
+
+    follower = threading.Thread(target=follow, daemon=True)
+    with environment({"ZEROBEV_PROGRESS": str(file)}):
+        if sys.stderr.isatty():
+            follower.start()
+        try:
+            yield
+        finally:
+            done.set()
+            if follower.is_alive():
+                follower.join()
+            os.close(terminal)
 
 
 @contextlib.contextmanager
@@ -203,7 +231,7 @@ def reproduce(
 
     report = reports / report_name(scale, scenes)
     executed, logs = report / "notebooks", report / "logs"
-    with only_run(logs), environment(variables):
+    with only_run(logs), environment(variables), shown_progress(logs / "progress.log"):
         shutil.rmtree(executed, ignore_errors=True)  # copies of an earlier run would pass for this one's
         for notebook in _progress(sources):
             copy = execute(notebook, executed / notebook.name, logs, parameters)

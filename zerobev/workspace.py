@@ -39,6 +39,8 @@ class Workspace:
         if self.source and not self.source.is_dir():
             raise InputError(f"scenes: expected a folder in HM3DSem layout, found nothing at {scenes}")
         self.reports = root / "reports" / (f"{scale}-{self.source.name}-scenes" if self.source else scale)
+        textures = os.environ.get("ZEROBEV_TEXTURES")  # set by `make reproduce TEXTURES=...`
+        self._textures = Path(textures) if textures else None
         self._cache = root / ".cache"
         self._workers = os.cpu_count() or 1
 
@@ -54,6 +56,12 @@ class Workspace:
             files = sorted(f for f in self.source.rglob("*.semantic.*") if f.is_file())
             identity["source"] = {f.name: f.stat().st_size for f in files}
         return identity
+
+    @property
+    def texture_identity(self) -> dict[str, Any]:
+        """What the texture bank depends on, as plain data."""
+        source = self._textures.name if self._textures else "procedural"
+        return {"version": DATA_VERSION, "sources": source, **asdict(self.scale.texture)}
 
     @property
     def runs(self) -> Path:
@@ -92,11 +100,12 @@ class Workspace:
         return ViewSet([Shard(shard_path(folder, out), self.scale.camera) for folder in folders])
 
     def bank(self) -> TextureBank:
-        """The texture bank of this scale."""
-        texture = self.scale.texture
-        path = self._cache / f"textures-{fingerprint({'version': DATA_VERSION, **asdict(texture)})}.npz"
+        """The texture bank of this scale, made of DTD's images where there are some, else of procedural ones."""
+        path = self._cache / f"textures-{fingerprint(self.texture_identity)}.npz"
         if not path.exists():
-            TextureBank.build(texture, SourceImages(), np.random.default_rng(self.scale.scenes.seed)).save(path)
+            sources = SourceImages(self._textures)
+            bank = TextureBank.build(self.scale.texture, sources, np.random.default_rng(self.scale.scenes.seed))
+            bank.save(path)
         return TextureBank.load(path)
 
 

@@ -8,7 +8,6 @@ the very weights of an unbroken one.
 import json
 import logging
 import pickle
-import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,11 +23,11 @@ from accelerate import Accelerator
 from safetensors.torch import save_model
 from torch import Tensor, nn
 from torch.optim import Optimizer, lr_scheduler
-from tqdm import tqdm
 
 from zerobev.config import TrainConfig
 from zerobev.errors import InputError
 from zerobev.learning.losses import Losses, zero_bev_loss
+from zerobev.progress import progress
 from zerobev.storage import replacing
 
 CHECKPOINT_SECONDS = 60  #: between two checkpoints, beside those at validations
@@ -139,14 +138,14 @@ def train(
     """
     accelerator = _accelerator(device)
     objective = objective or dice_objective(config.alpha)
-    quiet = not (accelerator.is_main_process and sys.stderr.isatty())
     forked = [accelerator.device] if accelerator.device.type == "cuda" else []
     with torch.random.fork_rng(forked), _logged(folder / "train.log", accelerator.is_main_process):
         run = _Run(model, config, folder, key, accelerator)
         try:
             run.resume()
             with closing(_prefetched(data, run.step, config.steps, accelerator)) as batches:
-                for batch in tqdm(batches, initial=run.step, total=config.steps, disable=quiet):
+                shown = progress(batches, "training", "step", config.steps, done=run.step)
+                for batch in shown if accelerator.is_main_process else batches:
                     torch.manual_seed(_step_seed(seed, run.step, accelerator.process_index))
                     run.advance(objective, batch)
                     if run.step % config.validate_every == 0 or run.step == config.steps:

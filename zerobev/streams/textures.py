@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from scipy import ndimage
-from tqdm import tqdm
 
 from zerobev.config import TextureConfig
 from zerobev.errors import InputError
+from zerobev.progress import progress
 from zerobev.storage import replacing
 from zerobev.streams.sources import SourceImages
 
@@ -203,12 +203,10 @@ class TextureBank:
     config: TextureConfig
 
     @classmethod
-    def build(
-        cls, config: TextureConfig, sources: SourceImages, rng: np.random.Generator, progress: bool = False
-    ) -> "TextureBank":
-        """Make `config.tiles` tiles of side `config.tile_px`; `progress` shows a bar."""
+    def build(cls, config: TextureConfig, sources: SourceImages, rng: np.random.Generator) -> "TextureBank":
+        """Make `config.tiles` tiles of side `config.tile_px`."""
         shape = (config.tile_px, config.tile_px)
-        streams = tqdm(rng.spawn(config.tiles), desc="textures", disable=not progress)
+        streams = progress(rng.spawn(config.tiles), "textures", "tile", config.tiles)
         return cls(np.stack([synth_texture(shape, config, sources, stream) for stream in streams]), config)
 
     def save(self, path: Path) -> None:
