@@ -1,0 +1,1 @@
+"""Parametric designs. A design takes a random generator and gives a `Piece`."""

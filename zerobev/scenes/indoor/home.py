@@ -1,0 +1,133 @@
+"""From a random generator to a complete `Scene`: plan, furnish, unwrap, bake, paint."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
+
+from zerobev.scenes.categories import label_of
+from zerobev.scenes.indoor.atlas import TEXELS_PER_M, Atlas, unwrap
+from zerobev.scenes.indoor.furnish import furnish
+from zerobev.scenes.indoor.light import Lamp, bake
+from zerobev.scenes.indoor.paint import paint
+from zerobev.scenes.indoor.plan import draw_plan
+from zerobev.scenes.indoor.shell import build_shell
+from zerobev.scenes.indoor.solids import Material, unseen
+from zerobev.scenes.scene import Instance, Scene
+
+
+@dataclass(frozen=True)
+class Home:
+    """A home before it is unwrapped: Q quads with their owners and materials."""
+
+    kinds: list[str]  #: kind of each room, by region
+    names: list[str]  #: of each instance; instance `i` has id i + 1
+    regions: list[int]  #: room number of each instance
+    quads: np.ndarray  #: (Q, 4, 3) float32, metres
+    owner: np.ndarray  #: (Q,) instance id, >= 1
+    hidden: np.ndarray  #: (Q,) bool
+    materials: list[Material]  #: Q
+    lamps: list[Lamp]
+
+
+def build_home(rng: np.random.Generator) -> Home:
+    """A furnished floor plan."""
+    rooms = draw_plan(rng)
+    names, regions, solids, lamps = [], [], [], []
+    for region, room in enumerate(rooms):
+        for items, light in (build_shell(rng, room), furnish(rng, room)):
+            lamps.extend(light)
+            for name, solid in items:
+                names.append(name)
+                regions.append(region)
+                solids.append(solid)
+    counts = [len(solid.quads) for solid in solids]
+    quads = np.concatenate([solid.quads for solid in solids]).astype(np.float32)
+    return Home(
+        kinds=[room.kind for room in rooms],
+        names=names,
+        regions=regions,
+        quads=quads,
+        owner=np.repeat(np.arange(1, len(names) + 1), counts),
+        hidden=np.concatenate([solid.hidden for solid in solids]) | unseen(quads),
+        materials=[material for solid in solids for material in solid.materials],
+        lamps=lamps,
+    )
+
+
+def generate_home(name: str, rng: np.random.Generator) -> Scene:
+    """A furnished home with its atlas, annotation and photographed textures (paper, Section 5: HM3DSem stands in).
+
+    Rooms, furniture and their numbers follow what was measured on HM3DSem. Light is part of the textures
+    (`unlit`), ceilings face downwards only, every other solid is closed. Texels are 1 cm everywhere.
+    The same state of `rng` gives the same home, byte for byte.
+    """
+    home = build_home(rng)
+    quads = home.quads.astype(np.float64)
+    atlas = unwrap(quads, home.hidden)
+    faces, quad_of_face, corner = _triangles(quads)
+    size_m = np.stack([np.ptp(atlas.corners[:, :, axis], axis=1) for axis in (1, 0)], axis=1) / TEXELS_PER_M
+    albedo = np.array([np.mean([m.color, m.second], axis=0) for m in home.materials]) ** 2
+    opaque = np.array([not m.glow for m in home.materials])
+    light = bake(quads, atlas.origin, atlas.right, atlas.down, size_m, faces, albedo, home.lamps, home.hidden, opaque)
+    textures = paint(atlas, home.hidden, home.materials, light)
+    face_uv = atlas.uv[quad_of_face[:, None], corner]
+    face_chart = atlas.chart[quad_of_face]
+    vertices = home.quads.reshape(-1, 3)
+    return Scene(
+        name=name,
+        vertices=vertices,
+        faces=faces,
+        face_uv=face_uv,
+        face_chart=face_chart,
+        chart_instance=atlas.owner_images(home.owner),
+        instances=_instances(home),
+        photograph=_photograph(atlas, vertices, faces, face_chart, textures),
+        unlit=True,
+        double_sided=False,
+    )
+
+
+def _triangles(quads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(F, 3) int32 faces over the quads' corners, (F,) their quads, (F, 3) their corners; none without area."""
+    corner = np.tile([[0, 1, 2], [0, 2, 3]], (len(quads), 1))
+    quad = np.repeat(np.arange(len(quads)), 2)
+    is_triangle = (quads[:, 2] == quads[:, 3]).all(axis=1)
+    keep = np.ones(len(quad), bool)
+    keep[1::2] = ~is_triangle
+    quad, corner = quad[keep], corner[keep]
+    return (quad[:, None] * 4 + corner).astype(np.int32), quad, corner
+
+
+def _instances(home: Home) -> tuple[Instance, ...]:
+    """One row an instance; colours run through a fixed permutation of 24-bit numbers, so they are unique."""
+    rows = []
+    for index, (name, region) in enumerate(zip(home.names, home.regions), start=1):
+        code = index * 0x9E3779 % 0x1000000  # odd factor: a bijection, 0 stays 0
+        rows.append(Instance(index, (code >> 16, code >> 8 & 255, code & 255), name, region, label_of(name)))
+    return tuple(rows)
+
+
+def _photograph(
+    atlas: Atlas, vertices: np.ndarray, faces: np.ndarray, face_chart: np.ndarray, textures: list[np.ndarray]
+) -> trimesh.Scene:
+    """One textured geometry a chart."""
+    scene = trimesh.Scene()
+    uv = atlas.uv.reshape(-1, 2) * [1, -1] + [0, 1]  # image formats put v = 0 at the bottom
+    for chart, texture in enumerate(textures):
+        used, local = np.unique(faces[face_chart == chart], return_inverse=True)
+        material = PBRMaterial(
+            name=f"chart{chart}",
+            baseColorTexture=Image.fromarray(texture),
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
+            doubleSided=False,
+        )
+        mesh = trimesh.Trimesh(
+            vertices[used], local.reshape(-1, 3), visual=TextureVisuals(uv[used], material=material), process=False
+        )
+        scene.add_geometry(mesh, geom_name=f"chart{chart}")
+    return scene
