@@ -9,16 +9,21 @@ import os
 import platform
 import resource
 import subprocess
+import zlib
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from zerobev.errors import InputError
 from zerobev.learning.metrics import Counts
 from zerobev.storage import replacing, write_json
+
+# what NumPy raises for a file that is missing, cut short, or something else
+_DAMAGED = (OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class RecordStore:
         try:
             with np.load(path) as file:
                 return np.unpackbits(file["maps"], axis=-1, count=int(file["cells"])).astype(bool)
-        except (OSError, ValueError, KeyError) as error:
+        except _DAMAGED as error:
             raise InputError(f"{path}: expected the maps of a run, found {error}") from None
 
     def write_gallery(self, name: str, **arrays: np.ndarray) -> None:
@@ -87,8 +92,11 @@ class RecordStore:
         path = self._gallery / f"{name}.npz"
         if not path.exists():
             return None
-        with np.load(path) as file:
-            return dict(file)
+        try:
+            with np.load(path) as file:
+                return dict(file)
+        except _DAMAGED as error:
+            raise InputError(f"{path}: expected the gallery's views, found {error}") from None
 
     def _maps_path(self, key: str) -> Path:
         return self._gallery / f"{key}.npz"

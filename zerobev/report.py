@@ -10,9 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from zerobev.config import LABELS, CameraConfig
+from zerobev.errors import InputError
 from zerobev.learning.metrics import Statistic, bootstrap_difference, class_iou, iou_per_class, pixel_iou
 from zerobev.paper import Ordering, Row
 from zerobev.records import Record
+from zerobev.scenes.scene import Scene
+from zerobev.sensors.cameras import Pose
+from zerobev.sensors.gbuffer import RayCaster
 
 #: One colour a class, in the order of `LABELS`; what is none of them is light grey.
 COLORS = ("#4c566a", "#c9b79c", "#e07a1f", "#3a7d44", "#2f6db5", "#7cc36e", "#b04fb0", "#d62839")
@@ -56,9 +60,17 @@ class Verdict:
 
 
 def judge(claim: Ordering, rows: dict[str, Row], records: Sequence[Record]) -> Verdict:
-    """Whether the better row is better here too: the interval of the paired difference lies on one side of zero."""
+    """Whether the better row is better here too: the interval of the paired difference lies on one side of zero.
+
+    The runs must be on the same test scenes, else it is an `InputError`.
+    """
     published = _published(rows[claim.better], claim.metric) - _published(rows[claim.worse], claim.metric)
-    better, worse = ([r.counts for r in records if r.row == row] for row in (claim.better, claim.worse))
+    runs = [record for record in records if record.row in (claim.better, claim.worse)]
+    if len({tuple(run.scenes) for run in runs}) > 1:
+        raise InputError(
+            f"records of {claim.better} and {claim.worse}: expected runs on the same test scenes, found others"
+        )
+    better, worse = ([run.counts for run in runs if run.row == row] for row in (claim.better, claim.worse))
     named = f"({claim.better}) > ({claim.worse}), {claim.metric} IoU: {claim.text}"
     if not better or not worse:
         return Verdict(claim.id, claim.table, named, round(published, 1), None, None, None, "not run")
@@ -133,3 +145,35 @@ def metric_extent(camera: CameraConfig) -> tuple[float, float, float, float]:
 
 def _rgb(color: str) -> np.ndarray:
     return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)], np.uint8)
+
+
+def plan(scene: Scene, cell_m: float = 0.05) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """The whole home from above: (M, M) int8 labels, and the `extent` in world metres for `imshow`."""
+    low, high = scene.vertices[:, :2].min(axis=0), scene.vertices[:, :2].max(axis=0)
+    side_m = float((high - low).max())
+    # a BEV camera large enough for the home, standing at the middle of its southern edge and looking north
+    camera = CameraConfig(fpv_px=1, bev_px=round(side_m / cell_m), bev_extent_m=side_m)
+    middle = float((low[0] + high[0]) / 2)
+    seen = RayCaster(scene).bev(Pose(middle, float(low[1]), float(scene.vertices[:, 2].min()), np.pi / 2), camera)
+    extent = (middle - side_m / 2, middle + side_m / 2, float(low[1]), float(low[1]) + side_m)
+    return scene.instance_label[seen.instance], extent
+
+
+class Checks:
+    """What a notebook checked, claim by claim, for its closing table."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[str, str, str]] = []
+
+    def holds(self, claim: str, expected: str, condition: bool) -> None:
+        """Assert `condition`, which must hold on any machine, and note that it does."""
+        assert condition, f"{claim}: expected {expected}"
+        self._rows.append((claim, expected, "holds"))
+
+    def note(self, claim: str, expected: str, verdict: str) -> None:
+        """Note the verdict on a claim that may turn out either way."""
+        self._rows.append((claim, expected, verdict))
+
+    def table(self) -> pd.DataFrame:
+        """Claim, what was expected, and the verdict."""
+        return pd.DataFrame(self._rows, columns=["claim", "expected", "verdict"]).set_index("claim")

@@ -1,5 +1,7 @@
 """Photographs (RGB) of a scene, rasterised by pyrender through EGL: a GPU where there is one, else Mesa."""
 
+import atexit
+import functools
 import os
 
 import numpy as np
@@ -28,7 +30,7 @@ _LINEAR = pyrender.Sampler(magFilter=pyrender.GLTF.LINEAR, minFilter=pyrender.GL
 
 
 class Photographer:
-    """Takes photographs of one scene with one camera. Free the GL context with `close`, or use `with`."""
+    """Takes photographs of one scene with one camera. All of a process share one GL context."""
 
     def __init__(self, scene: Scene, camera: CameraConfig) -> None:
         self._camera = camera
@@ -44,17 +46,7 @@ class Photographer:
         self._eye = self._scene.add(lens)
         if not scene.unlit:
             self._scene.add(pyrender.PointLight(intensity=_HEADLAMP), parent_node=self._eye)
-        self._renderer = pyrender.OffscreenRenderer(side, side)
-
-    def __enter__(self) -> "Photographer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the GL context."""
-        self._renderer.delete()
+        self._side = side
 
     def take(self, pose: Pose) -> np.ndarray:
         """(H, W, 3) uint8 sRGB photograph from `pose`."""
@@ -72,7 +64,17 @@ class Photographer:
         world_T_camera[:3, :3] = pose.world_R_camera @ _CAMERA_R_OPENGL
         world_T_camera[:3, 3] = pose.centre(self._camera)
         self._scene.set_pose(self._eye, world_T_camera)
-        return self._renderer.render(self._scene, self._flags)
+        renderer = _renderer()
+        renderer.viewport_width = renderer.viewport_height = self._side
+        return renderer.render(self._scene, self._flags)
+
+
+@functools.cache
+def _renderer() -> pyrender.OffscreenRenderer:
+    """The process's one renderer: closing one of several would take the display from the others."""
+    renderer = pyrender.OffscreenRenderer(1, 1)
+    atexit.register(renderer.delete)
+    return renderer
 
 
 def _primitives(photograph: trimesh.Scene) -> list[pyrender.Primitive]:

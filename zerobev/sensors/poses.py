@@ -85,22 +85,29 @@ def _surface_samples(scene: Scene, keep: np.ndarray, rng: np.random.Generator) -
 def _storeys(
     scene: Scene, floor: np.ndarray, low: np.ndarray, shape: tuple[int, int], agent: AgentConfig
 ) -> list[np.ndarray]:
-    """Floor height of each grid cell, one (I, J) array a storey from the top down; NaN where there is no floor."""
+    """Floor height of each grid cell, one (I, J) array a storey from the lowest up; NaN where there is no floor.
+
+    Floors of one storey are no step higher than `climb_m` apart, so that a gallery ends at its edge.
+    """
     embree = EmbreeScene()
     mesh = TriangleMesh(embree, scene.vertices.astype(np.float32), scene.faces[floor].astype(np.int32))
     i, j = np.indices(shape)
     start = np.full(shape, scene.vertices[:, 2].max() + 1.0)
-    storeys = []
+    layers = []  # from the top down; one layer may be upper floor here and lower floor there
     while True:
         origins = np.stack([low[0] + (i + 0.5) * agent.grid_m, low[1] + (j + 0.5) * agent.grid_m, start], axis=-1)
         origins = np.ascontiguousarray(origins.reshape(-1, 3), np.float32)
         down = np.broadcast_to(np.array([0, 0, -1], np.float32), origins.shape)
         found = embree.run(origins, np.ascontiguousarray(down), query="INTERSECT", output=True)
         hit = found["primID"].reshape(shape) >= 0
-        if not hit.any():
-            del mesh  # Embree points into its arrays until here
-            return storeys
         height = np.where(hit, start - found["tfar"].reshape(shape), np.nan)
-        storeys.append(height)
+        layers.append(height)
+        if not hit.any():
+            break
         # what lies within the agent's height below is the same storey (the floor under a rug)
         start = np.where(hit, height - agent.height_m, -1e6)
+    del mesh  # Embree points into its arrays until here
+    heights = np.sort(np.concatenate([height[np.isfinite(height)] for height in layers]))
+    lowest = heights[1:][np.diff(heights) > agent.climb_m]  # of each storey but the first
+    storey = np.searchsorted(lowest, layers, side="right")
+    return [np.fmax.reduce(np.where(storey == k, layers, np.nan)) for k in range(len(lowest) + 1)]

@@ -19,7 +19,7 @@ from zerobev.errors import InputError, run_command
 from zerobev.progress import progress
 from zerobev.scenes.hm3dsem import read_scene, split_scenes
 from zerobev.storage import write_json
-from zerobev.streams.shards import checksum, write_shard
+from zerobev.streams.shards import Shard, checksum, write_shard
 from zerobev.streams.views import ViewSource
 
 
@@ -29,14 +29,24 @@ def shard_path(scene_folder: Path, out: Path) -> Path:
 
 
 def generate_shard(scene_folder: Path, out: Path, views: int, camera: CameraConfig, seed: int) -> Path:
-    """Record `views` views of one scene, unless its shard is there; returns the shard's path."""
+    """Record `views` views of one scene, unless its shard is there; returns the shard's path.
+
+    Raises `InputError` for a broken scene, and for a shard that is damaged or belongs to another run.
+    """
     path = shard_path(scene_folder, out)
-    if not path.exists():
-        scene = read_scene(scene_folder)
-        # the scene's name is part of the seed, so that its views do not depend on which others there are
-        rng = np.random.default_rng([seed, zlib.crc32(scene_folder.name.encode())])
-        with ViewSource(scene, camera, rng) as source:
-            write_shard(path, scene, (source.draw() for _ in range(views)), camera, seed)
+    if path.exists():
+        found = Shard(path, camera)
+        if (len(found), found.seed) != (views, seed):
+            expected = f"{views} views with seed {seed}"
+            raise InputError(f"{path}: expected {expected}, found {len(found)} with seed {found.seed}")
+        return path
+    if views < 1:
+        raise InputError(f"views: expected 1 or more, found {views}")
+    scene = read_scene(scene_folder)
+    # the scene's name is part of the seed, so that its views do not depend on which others there are
+    rng = np.random.default_rng([seed, zlib.crc32(scene_folder.name.encode())])
+    source = ViewSource(scene, camera, rng)
+    write_shard(path, scene, (source.draw() for _ in range(views)), camera, seed)
     return path
 
 
@@ -45,14 +55,16 @@ def generate(
 ) -> dict[str, str]:
     """Record every scene into `out` and write `manifest.json` there (shard -> SHA-256, seed, number of views).
 
-    A broken scene is skipped. Returns what was wrong, scene name -> message; empty when all went well.
+    A broken scene is skipped, and a shard of another run is left alone. Returns what was wrong, scene name ->
+    message; empty when all went well.
     """
     missing = [folder for folder in scene_folders if not shard_path(folder, out).exists()]
     jobs = (joblib.delayed(_attempt)(folder, out, views, camera, seed) for folder in missing)
     outcomes = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
     shown = progress(outcomes, f"views of {out.name}", "scene", len(missing))
-    broken = dict(outcome for outcome in shown if outcome)
-    shards = sorted(path for folder in scene_folders if (path := shard_path(folder, out)).exists())
+    recorded = (_attempt(folder, out, views, camera, seed) for folder in scene_folders if folder not in missing)
+    broken = dict(outcome for outcome in (*shown, *recorded) if outcome)
+    shards = sorted(shard_path(folder, out) for folder in scene_folders if folder.name not in broken)
     manifest = {"seed": seed, "views": views, "shards": {path.name: checksum(path) for path in shards}}
     write_json(out / "manifest.json", manifest)
     return broken
@@ -77,7 +89,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     options = parser.parse_args()
     scale = config.scale(options.scale)
-    views = options.views or scale.scenes.views
+    views = scale.scenes.views if options.views is None else options.views
     split = split_scenes(options.scenes)
     broken: dict[str, str] = {}
     for name in ("train", "validation", "test"):

@@ -46,9 +46,10 @@ class Shard:
                 recorded = json.loads(file.attrs["camera"])
                 self.scene = str(file.attrs["scene"])
                 self.charts = int(file.attrs["charts"])
+                self.seed = int(file.attrs["seed"])
                 self.instance_label = file["instance_label"][:]
                 self._length = len(file["pose"])
-        except (OSError, KeyError) as error:
+        except (OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: expected a shard of views, found {_short(error)}") from None
         if recorded != json.loads(json.dumps(asdict(camera))):
             raise InputError(f"{path}: expected views of {camera}, found {recorded}")
@@ -62,9 +63,9 @@ class Shard:
 
     def view(self, index: int) -> View:
         """View number `index`."""
-        if self._file is None:
-            self._file = h5py.File(self.path)
         try:
+            if self._file is None:
+                self._file = h5py.File(self.path)
             return View(**{name: self._file[name][index] for name in _FIELDS})
         except (OSError, KeyError) as error:
             raise InputError(f"{self.path}: expected view {index}, found {_short(error)}") from None

@@ -32,7 +32,7 @@ class View:
 
 
 class ViewSource:
-    """Draws views of one scene. Holds a GL context: free it with `close`, or use `with`."""
+    """Draws views of one scene."""
 
     def __init__(
         self, scene: Scene, camera: CameraConfig, rng: np.random.Generator, agent: AgentConfig | None = None
@@ -44,16 +44,6 @@ class ViewSource:
         self.floor = navigable_floor(scene, self._agent, rng)
         self._caster = RayCaster(scene)
         self._photographer = Photographer(scene, camera)
-
-    def __enter__(self) -> "ViewSource":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the GL context."""
-        self._photographer.close()
 
     def draw(self) -> View:
         """The view at a fresh pose; poses that face a wall are refused.

@@ -1,0 +1,188 @@
+"""Tables, verdicts and pictures from records whose numbers are known by hand; the paper's own sums."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_rgb
+from scenes_for_tests import box, build, room
+
+from zerobev.config import LABELS, NO_LABEL, CameraConfig
+from zerobev.errors import InputError
+from zerobev.learning.metrics import Counts
+from zerobev.paper import ORDERINGS, TABLES, Ordering
+from zerobev.records import Record
+from zerobev.report import COLORS, Checks, judge, label_image, maps_image, metric_extent, plan, table, verdict_table
+
+ROWS = TABLES[1]
+CLAIM = Ordering("1.5", 1, "d", "c", "class", "better")
+
+
+def record(row: str, percent: list[list[float]], seed: int = 0, cells: int = 1000) -> Record:
+    """A run with the given IoU of each test scene and class, in percent."""
+    union = np.full(np.shape(percent), cells, np.int64)
+    counts = Counts((np.array(percent) / 100 * cells).round().astype(np.int64), union)
+    scenes = [f"scene{i}" for i in range(len(percent))]
+    return Record(f"{row}-{seed}", row, seed, {}, {}, {}, scenes, counts, {})
+
+
+def test_printed_averages_are_means_of_the_printed_classes():
+    for number, rows in TABLES.items():
+        for name, row in rows.items():
+            assert len(row.per_class) == len(LABELS) and (row.table, row.row) == (number, name)
+            # both sides are rounded to a tenth
+            assert row.class_iou == pytest.approx(np.mean(row.per_class), abs=0.1), (number, name)
+
+
+def test_rows_that_the_paper_prints_twice_are_the_same():
+    for name in ("c", "d"):
+        copies = [rows[name] for rows in TABLES.values() if name in rows]
+        assert len(copies) >= 3
+        assert len({(row.per_class, row.class_iou, row.pixel_iou) for row in copies}) == 1
+
+
+def test_every_ordering_names_rows_of_its_table_and_holds_in_the_paper():
+    assert len({claim.id for claim in ORDERINGS}) == len(ORDERINGS)
+    for claim in ORDERINGS:
+        verdict = judge(claim, TABLES[claim.table], [])
+        assert verdict.paper > 0 and verdict.verdict == "not run"
+        assert verdict.ours is verdict.low is verdict.high is None
+
+
+def test_table_by_hand():
+    """Two seeds and two scenes of equal size: IoU is the mean over both."""
+    low, high = [10, 20, 30, 40, 50, 60, 70, 80], [30, 20, 30, 40, 50, 60, 70, 90]
+    records = [record("c", [low, low]), record("c", [low, high], seed=1)]
+    found = table(ROWS, records)
+    assert list(found.columns) == [*LABELS, "class avg.", "pixel avg."]
+    assert [key[::2] for key in found.index] == [
+        (row, source) for row in ROWS for source in (("paper", "ours") if row == "c" else ("paper",))
+    ]
+    paper, ours = (found.xs(("c", source), level=("row", "source")).iloc[0] for source in ("paper", "ours"))
+    assert paper.tolist() == [*ROWS["c"].per_class, 24.2, 58.2]
+    # second seed: wall (10 + 30) / 2, tv (80 + 90) / 2; then the mean of both seeds
+    assert ours.tolist() == pytest.approx([15, 20, 30, 40, 50, 60, 70, 82.5, 45.9, 45.9])
+
+
+def test_pixel_average_weighs_by_area_and_class_average_does_not():
+    union = np.array([[100, 900, 0, 0, 0, 0, 0, 0]])
+    counts = Counts(union * [[1, 0, 0, 0, 0, 0, 0, 0]], union)
+    one = Record("c-0", "c", 0, {}, {}, {}, ["scene"], counts, {})
+    ours = table(ROWS, [one]).xs(("c", "ours"), level=("row", "source")).iloc[0]
+    assert ours["class avg."] == 50 and ours["pixel avg."] == 10
+    assert ours[["wall", "floor"]].tolist() == [100, 0] and ours[list(LABELS[2:])].isna().all()
+
+
+def test_table_follows_every_count_and_row():
+    base = [[10.0] * 8, [20.0] * 8]
+    before = table(ROWS, [record("c", base), record("d", base[::-1])])
+    for scene, column in ((0, 0), (1, 7)):
+        changed = np.array(base)
+        changed[scene, column] += 5
+        after = table(ROWS, [record("c", changed), record("d", base[::-1])])
+        differs = (before != after) & ~(before.isna() & after.isna())
+        rows, columns = np.nonzero(differs.to_numpy())
+        assert {before.index[i][::2] for i in rows} == {("c", "ours")}
+        assert {before.columns[j] for j in columns} == {LABELS[column], "class avg.", "pixel avg."}
+    better = record("d", [[50.0] * 8] * 2)
+    swapped = table(ROWS, [record("d", base), record("c", [[50.0] * 8] * 2)])
+    assert not table(ROWS, [record("c", base), better]).equals(swapped)
+    assert not table(ROWS, []).equals(table({**ROWS, "c": ROWS["d"], "d": ROWS["c"]}, []))
+
+
+@pytest.mark.parametrize(
+    "gain, expected",
+    [([5, 6, 4, 5, 7, 5], "holds"), ([-5, -6, -4, -5, -7, -5], "does not hold"), ([5, -6, 4, -5, 7, -4], "undecided")],
+)
+@pytest.mark.parametrize("metric", ["class", "pixel", "floor"])
+def test_verdicts(gain, expected, metric):
+    worse = np.linspace(20, 40, 6)[:, None] + np.zeros(8)
+    better = worse + np.array(gain)[:, None]
+    claim = Ordering("x", 1, "d", "c", metric, "text")
+    verdict = judge(claim, ROWS, [record("c", worse), record("d", better)])
+    assert verdict.verdict == expected
+    assert verdict.ours == pytest.approx(np.mean(gain), abs=0.06)
+    assert min(gain) <= verdict.low <= verdict.ours <= verdict.high <= max(gain)
+    published = {"class": 27.7 - 24.2, "pixel": 58.9 - 58.2, "floor": 58.2 - 58.4}[metric]
+    assert verdict.paper == pytest.approx(published)
+    assert verdict == judge(claim, ROWS, [record("c", worse), record("d", better)])  # no chance in it
+
+
+def test_verdict_on_one_class_looks_at_that_class():
+    worse = np.full((6, 8), 30.0)
+    better = worse + 5 * np.eye(8)[LABELS.index("floor")] - 5 * np.eye(8)[LABELS.index("bed")]
+    records = [record("c", worse), record("d", better)]
+    verdicts = {m: judge(Ordering("x", 1, "d", "c", m, ""), ROWS, records).verdict for m in ("floor", "bed", "wall")}
+    assert verdicts == {"floor": "holds", "bed": "does not hold", "wall": "undecided"}
+
+
+def test_verdict_is_on_the_mean_over_seeds():
+    base = np.full((6, 8), 30.0)
+    records = [record("c", base), record("d", base + 9, seed=0), record("d", base - 3, seed=1)]
+    assert judge(CLAIM, ROWS, records).ours == pytest.approx(3)
+
+
+def test_runs_on_other_test_scenes_are_not_compared():
+    base = np.full((2, 8), 30.0)
+    other = record("d", base + 5)
+    other.scenes[:] = other.scenes[::-1]
+    with pytest.raises(InputError, match="expected runs on the same test scenes"):
+        judge(CLAIM, ROWS, [record("c", base), other])
+
+
+def test_verdict_table():
+    base = np.full((6, 8), 30.0)
+    frame = verdict_table([judge(claim, ROWS, [record("c", base), record("d", base + 5)]) for claim in ORDERINGS])
+    assert list(frame.index) == [claim.id for claim in ORDERINGS]
+    assert frame.loc["1.5", ["paper", "ours", "low", "high", "verdict"]].tolist() == [3.5, 5, 5, 5, "holds"]
+    assert frame.loc["1.6", "verdict"] == "not run" and np.isnan(frame.loc["1.6", "ours"])
+    assert all(frame[column].dtype == float for column in ("paper", "ours", "low", "high"))
+
+
+def rgb(color: str) -> tuple[int, ...]:
+    return tuple(round(255 * channel) for channel in to_rgb(color))
+
+
+def test_colors_of_labels():
+    label = np.array([[*range(len(LABELS)), NO_LABEL]], np.int8)
+    image = label_image(label)
+    assert image.dtype == np.uint8 and image.shape == (1, 9, 3)
+    assert [tuple(color) for color in image[0, :8].tolist()] == [rgb(color) for color in COLORS]
+    assert len({tuple(color) for color in image[0].tolist()} | {(255, 255, 255)}) == 10
+    inside = np.arange(9)[None] % 2 == 0
+    masked = label_image(label, inside)
+    assert (masked[~inside] == 255).all() and np.array_equal(masked[inside], image[inside])
+
+
+def test_maps_are_drawn_like_labels_with_the_floor_below():
+    label = np.random.default_rng(0).integers(NO_LABEL, len(LABELS), (12, 12))
+    fov = np.random.default_rng(1).random((12, 12)) < 0.7
+    masks = label == np.arange(len(LABELS))[:, None, None]
+    assert np.array_equal(maps_image(masks, fov), label_image(label, fov))
+    everywhere = masks.copy()
+    everywhere[LABELS.index("floor")] = True
+    expected = np.where(label == NO_LABEL, LABELS.index("floor"), label)
+    assert np.array_equal(maps_image(everywhere, fov), label_image(expected, fov))
+
+
+def test_plan_shows_a_home_in_world_metres():
+    label, extent = plan(build([*room((6, 4, 2.5), corner=(1, -2, 0)), box("bed", (5, -1, 0), (6.5, 1, 0.5))]))
+    assert extent == pytest.approx((1, 7, -2, 4))
+    side = label.shape[0]
+    rows, columns = np.indices(label.shape)
+    x, y = 1 + (columns + 0.5) * 6 / side, 4 - (rows + 0.5) * 6 / side
+    expected = np.where(y < 2, LABELS.index("floor"), NO_LABEL)
+    expected[(x > 5) & (x < 6.5) & (y > -1) & (y < 1)] = LABELS.index("bed")
+    assert (label != expected).mean() < 0.01
+    assert metric_extent(CameraConfig(fpv_px=4, bev_px=4)) == (-2.5, 2.5, 0.0, 5.0)
+
+
+def test_checks_note_what_holds_and_stop_at_what_does_not():
+    checks = Checks()
+    checks.holds("sum", "2", 1 + 1 == 2)
+    checks.note("order", "c > d", "undecided")
+    with pytest.raises(AssertionError, match="product: expected 5"):
+        checks.holds("product", "5", False)
+    expected = pd.DataFrame(
+        {"expected": ["2", "c > d"], "verdict": ["holds", "undecided"]}, index=pd.Index(["sum", "order"], name="claim")
+    )
+    pd.testing.assert_frame_equal(checks.table(), expected, check_dtype=False)
