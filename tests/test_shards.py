@@ -166,7 +166,7 @@ def test_damaged_view_is_named(scene, views, tmp_path):
     path = tmp_path / "a.h5"
     write_shard(path, scene, views, CAMERA, SEED)
     with h5py.File(path) as file:
-        chunk = file["rgb"].id.get_chunk_info(1)
+        chunk = file["views"].id.get_chunk_info(1)
     content = bytearray(path.read_bytes())
     content[chunk.byte_offset : chunk.byte_offset + chunk.size] = b"\xff" * chunk.size
     path.write_bytes(content)

@@ -143,7 +143,7 @@ SCALES = {
                 decoder_channels=(16, 32, 32),
                 dropout=0.0,
             ),
-            train=TrainConfig(steps=120, learning_rate=2e-3, decay_every=40, validate_every=40),
+            train=TrainConfig(steps=240, learning_rate=1e-3, decay_every=80, validate_every=80, warmup=20),
             texture=TextureConfig(tiles=8, tile_px=512),
         ),
         Scale(
@@ -162,7 +162,7 @@ SCALES = {
                 decoder_channels=(64, 96, 128),
                 dropout=0.0,
             ),
-            train=TrainConfig(steps=2000, learning_rate=8e-4, decay_every=250, validate_every=250, warmup=50),
+            train=TrainConfig(steps=1000, learning_rate=8e-4, decay_every=200, validate_every=200, warmup=50),
         ),
         Scale(
             name="paper",

@@ -20,12 +20,11 @@ _FIELDS = tuple(field.name for field in fields(View))
 
 def write_shard(path: Path, scene: Scene, views: Iterable[View], camera: CameraConfig, seed: int) -> None:
     """Write `views` of `scene` to `path`; nothing is left behind when a view fails."""
+    rows = [tuple(getattr(view, name) for name in _FIELDS) for view in views]
+    record = np.dtype([(name, value.dtype, value.shape) for name, value in zip(_FIELDS, rows[0])])
     with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
-        columns = [[getattr(view, name) for name in _FIELDS] for view in views]
-        for name, column in zip(_FIELDS, zip(*columns)):
-            values = np.stack(column)
-            # one chunk a view: a training sample reads one view at random
-            file.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="lzf", shuffle=True)
+        # one record and one chunk a view: a training sample reads one view at random, in one call
+        file.create_dataset("views", data=np.array(rows, record), chunks=(1,), compression="lzf")
         file["instance_label"] = scene.instance_label
         file.attrs["scene"] = scene.name
         file.attrs["charts"] = len(scene.chart_instance)
@@ -48,25 +47,26 @@ class Shard:
                 self.charts = int(file.attrs["charts"])
                 self.seed = int(file.attrs["seed"])
                 self.instance_label = file["instance_label"][:]
-                self._length = len(file["pose"])
+                self._length = len(file["views"])
         except (OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: expected a shard of views, found {_short(error)}") from None
         if recorded != json.loads(json.dumps(asdict(camera))):
             raise InputError(f"{path}: expected views of {camera}, found {recorded}")
-        self._file: h5py.File | None = None
+        self._views: h5py.Dataset | None = None
 
     def __len__(self) -> int:
         return self._length
 
     def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_file": None}
+        return {**self.__dict__, "_views": None}
 
     def view(self, index: int) -> View:
         """View number `index`."""
         try:
-            if self._file is None:
-                self._file = h5py.File(self.path)
-            return View(**{name: self._file[name][index] for name in _FIELDS})
+            if self._views is None:
+                self._views = h5py.File(self.path)["views"]
+            record = self._views[index]
+            return View(**{name: record[name] for name in _FIELDS})
         except (OSError, KeyError) as error:
             raise InputError(f"{self.path}: expected view {index}, found {_short(error)}") from None
 

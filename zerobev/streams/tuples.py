@@ -47,6 +47,7 @@ class SynthTuples:
         self._camera = camera
         self._seed = seed
         self._batch = batch
+        self._epoch = -1
 
     def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, torch.Tensor]:
         """The batch of a training step; with several ranks each gets every `ranks`-th sample of it."""
@@ -56,12 +57,19 @@ class SynthTuples:
     def sample(self, index: int) -> Sample:
         """Tuple number `index`."""
         epoch, position = divmod(index, len(self._views))
-        order = np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))
-        shard, view = self._views.locate(int(order[position]))
+        shard, view = self._views.locate(int(self._order(epoch)[position]))
         draw = self._bank.draw(np.random.default_rng([self._seed, 1, index]), self._views.shards[shard].charts)
         zero = self._bank.look_up(view.fpv_texel, draw)
         target = self._bank.look_up(view.bev_texel, draw)
         return view_sample(view, self._camera, shard, zero[None], target[None])
+
+
+    def _order(self, epoch: int) -> np.ndarray:
+        """The order of the views in a pass over them; kept until another pass is asked for."""
+        if self._epoch != epoch:
+            self._epoch = epoch
+            self._permutation = np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))
+        return self._permutation
 
 
 def semantic_batches(views: ViewSet, camera: CameraConfig, batch: int) -> Iterator[dict[str, torch.Tensor]]:
