@@ -11,7 +11,8 @@ SCALE ?= reduced
 SCENES ?=
 TEXTURES ?=
 FRESH ?=
-export SCALE SCENES TEXTURES
+SPOT ?=
+export SCALE SCENES TEXTURES SPOT
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -29,9 +30,14 @@ unexport PYTHONHOME PYTHONPATH
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
 
-reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper] [SCENES=dir] [TEXTURES=dir] [FRESH=1]
-	@$(PYTHON) -m zerobev.reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
-	    $${TEXTURES:+--textures "$$TEXTURES"} $(if $(filter-out 0,$(FRESH)),--fresh)
+# With FRESH=1 every run is computed anyway; otherwise one record is held against a run of today.
+reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper] [SCENES=dir] [TEXTURES=dir] [FRESH=1] [SPOT=row]
+	@fresh="$(filter-out 0,$(FRESH))"
+	export $${TEXTURES:+ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"}
+	$(PYTHON) -m zerobev.reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
+	    $${TEXTURES:+--textures "$$TEXTURES"} $${fresh:+--fresh}
+	[ -n "$$fresh" ] || $(PYTHON) -m zerobev.spot_check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
+	    $${SPOT:+--row "$$SPOT"}
 
 test: setup ## run the tests, then check every notebook against its committed outputs
 	@status=0

@@ -227,3 +227,11 @@ def test_ignored_outputs_are_counted(tag: str):
     assert ignores_output(new_code_cell("1", metadata={"tags": [tag]}))
     assert ignores_output(new_code_cell("  # NBVAL_IGNORE_OUTPUT\n1"))
     assert not ignores_output(new_code_cell("1  # NBVAL_IGNORE_OUTPUT", metadata={"tags": ["parameters"]}))
+
+
+def test_the_readme_shows_the_tours_first_picture():
+    assert "](reports/tour.png)" in (ROOT / "README.md").read_text()
+    shown = [
+        output for output in outputs(nbformat.read(NOTEBOOKS[0], as_version=4)) if "image/png" in output.get("data", {})
+    ]
+    assert (ROOT / "reports" / "tour.png").read_bytes() == base64.b64decode(shown[0].data["image/png"])

@@ -1,5 +1,6 @@
 """The workbook's command and the Makefile in front of it, on notebooks written for the purpose."""
 
+import base64
 import fcntl
 import os
 import re
@@ -127,17 +128,28 @@ def test_a_second_run_of_the_same_report_stops(folders):
     assert not (folders["reports"] / "smoke/notebooks").exists()
 
 
+def test_refreshing_keeps_the_first_picture_for_the_readme(folders):
+    draw = "import matplotlib.pyplot as plt\nlines = plt.plot([0, {0}])\nfigure = plt.gcf()"
+    write_notebook(folders["notebooks"] / "00_tour.ipynb", draw.format(1), draw.format(2))
+    write_notebook(folders["notebooks"] / "01_next.ipynb", draw.format(3))
+
+    refresh(**folders)
+
+    first = nbformat.read(folders["notebooks"] / "00_tour.ipynb", as_version=4).cells[2].outputs[0]
+    assert (folders["reports"] / "tour.png").read_bytes() == base64.b64decode(first.data["image/png"])
+
+
 def test_refreshing_twice_gives_the_same_bytes_and_a_failure_changes_none(folders):
     good, bad = folders["notebooks"] / "00_good.ipynb", folders["notebooks"] / "01_bad.ipynb"
     write_notebook(good, "for i in range(200):\n    print(i, flush=True)")
     write_notebook(bad, "1 / 0")
     before = bad.read_bytes()
     with pytest.raises(NotebookError, match="ZeroDivisionError: division by zero"):
-        refresh(folders["notebooks"])
+        refresh(**folders)
     assert bad.read_bytes() == before
     first = good.read_bytes()
     bad.unlink()
-    refresh(folders["notebooks"])
+    refresh(**folders)
     assert good.read_bytes() == first
     code = [cell for cell in nbformat.read(good, as_version=4).cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == [1, 2] and len(code[1].outputs) == 1
@@ -148,7 +160,7 @@ def test_plain_nbval_finds_a_changed_output_from_any_folder_without_a_home(folde
     write_notebook(
         folders["notebooks"] / "00_good.ipynb", "import matplotlib.pyplot as plt\n_ = plt.plot([0, 1])", "1 + 1"
     )
-    refresh(folders["notebooks"])
+    refresh(**folders)
     good = (folders["notebooks"] / "00_good.ipynb").read_text()
     assert '"image/png"' in good
     (folders["notebooks"] / "01_changed.ipynb").write_text(good.replace('"2"\n', '"3"\n'))

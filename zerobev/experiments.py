@@ -1,6 +1,5 @@
 """Which runs the tables need, as data, and the one way to get a run's record: read it, or compute it."""
 
-import shutil
 import time
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -44,8 +43,7 @@ def run(experiment: Experiment, workspace: Workspace, seed: int = 0) -> Record:
     the test scenes are touched once, by the weights that validated best.
     """
     store = RecordStore(workspace.reports)
-    key = run_key(experiment, workspace, seed)
-    return store.find(key) or _compute(experiment, workspace, seed, key, store)
+    return store.find(run_key(experiment, workspace, seed)) or compute(experiment, workspace, seed, store)
 
 
 def run_key(experiment: Experiment, workspace: Workspace, seed: int) -> str:
@@ -61,7 +59,9 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
     return config
 
 
-def _compute(experiment: Experiment, workspace: Workspace, seed: int, key: str, store: RecordStore) -> Record:
+def compute(experiment: Experiment, workspace: Workspace, seed: int, store: RecordStore) -> Record:
+    """Train, evaluate and keep the record in `store`, whether there is one or not."""
+    key = run_key(experiment, workspace, seed)
     test = workspace.views("test")
     history: History | None = None
     if experiment.method == "projection":
@@ -159,18 +159,3 @@ def _gallery_maps(projector: Projector, test: ViewSet, workspace: Workspace) -> 
         maps = projector(batch).cpu()
     inside = batch["fov"] > 0.5
     return ((maps if maps.dtype == torch.bool else maps > 0) & inside).numpy()
-
-
-def spot_check(workspace: Workspace, seed: int = 0, row: str = "c") -> tuple[Record, Record, float]:
-    """Compute a recorded run again, beside its record; returns (record, computed now, largest IoU difference)."""
-    experiment = next(e for e in TABLE_1 if e.row == row)
-    key = run_key(experiment, workspace, seed)
-    recorded = run(experiment, workspace, seed)
-    scratch = workspace.runs / "spot-check"
-    shutil.rmtree(scratch, ignore_errors=True)
-    again = _compute(experiment, workspace, seed, key, RecordStore(scratch))
-    differences = (
-        abs(again.counts.class_iou() - recorded.counts.class_iou()),
-        abs(again.counts.pixel_iou() - recorded.counts.pixel_iou()),
-    )
-    return recorded, again, max(differences)

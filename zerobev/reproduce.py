@@ -6,6 +6,7 @@ A run that was stopped is started again: the notebooks read what is already reco
 """
 
 import argparse
+import base64
 import contextlib
 import fcntl
 import os
@@ -239,10 +240,18 @@ def reproduce(
     return report
 
 
-def refresh(notebooks: Path = ROOT / "notebooks") -> None:
+def first_picture(notebook: NotebookNode) -> bytes | None:
+    """The first figure among a notebook's outputs, as PNG; None if it has none."""
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    pictures = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
+    return base64.b64decode(pictures[0]) if pictures else None
+
+
+def refresh(notebooks: Path = ROOT / "notebooks", reports: Path = ROOT / "reports") -> None:
     """Execute every notebook of the folder again with its own parameters and put it, whole and clean, in its place.
 
-    Clean: no trace of when and by what a notebook was executed, so that equal outputs are equal files.
+    Clean: no trace of when and by what a notebook was executed, so that equal outputs are equal files. The first
+    picture of the first notebook, the tour, is the README's: it goes to `reports/tour.png`.
     """
     cache = CACHE / "notebooks"
     with only_run(cache), environment(kernel_settings()):
@@ -253,6 +262,10 @@ def refresh(notebooks: Path = ROOT / "notebooks") -> None:
                 cell.metadata = {"tags": cell.metadata.tags} if cell.metadata.get("tags") else {}
             with replacing(notebook) as clean:
                 nbformat.write(copy, clean)
+    picture = first_picture(nbformat.read(_notebooks_in(notebooks)[0], as_version=4))
+    if picture:
+        with replacing(reports / "tour.png") as file:
+            file.write_bytes(picture)
 
 
 def main(**folders: Path) -> None:
@@ -267,7 +280,7 @@ def main(**folders: Path) -> None:
     given = parser.parse_args()
     try:
         if given.in_place:
-            refresh()
+            refresh(**folders)
         else:
             report = reproduce(given.scale, given.scenes, given.textures, given.fresh, **folders)
             print(f"notebooks and their HTML: {report / 'notebooks'}")
