@@ -31,7 +31,7 @@ help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
 
 # With FRESH=1 every run is computed anyway; otherwise one record is held against a run of today.
-reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper] [SCENES=dir] [TEXTURES=dir] [FRESH=1] [SPOT=row]
+reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper SCENES=dir TEXTURES=dir FRESH=1 SPOT=row]
 	@fresh="$(filter-out 0,$(FRESH))"
 	export $${TEXTURES:+ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"}
 	$(PYTHON) -m zerobev.reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \

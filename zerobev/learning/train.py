@@ -165,7 +165,7 @@ class _Run:
     def __init__(self, model: nn.Module, config: TrainConfig, folder: Path, key: str, accelerator: Accelerator) -> None:
         self.bare = model
         self.config, self.folder, self.key, self.accelerator = config, folder, key, accelerator
-        optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
+        optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
         self.schedule = Schedule(optimizer, config)
         self.model, self.optimizer = accelerator.prepare(model, optimizer)
         self.step = 0
