@@ -11,7 +11,7 @@ from zerobev.config import LABELS
 from zerobev.learning.evaluate import Projector, evaluate, model_projector
 from zerobev.learning.train import History, train
 from zerobev.models.zero_bev import ZeroBEV
-from zerobev.records import Record, RecordStore, origin, peak_memory_mb
+from zerobev.records import Record, RecordStore, git_revision, origin, peak_memory_mb
 from zerobev.streams.projection import project
 from zerobev.streams.tuples import SynthTuples, ViewSet, collate, semantic_batches, semantic_sample
 from zerobev.workspace import Workspace, fingerprint
@@ -62,6 +62,7 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
 def compute(experiment: Experiment, workspace: Workspace, seed: int, store: RecordStore) -> Record:
     """Train, evaluate and keep the record in `store`, whether there is one or not."""
     key = run_key(experiment, workspace, seed)
+    revision = git_revision()  # of the code that is at work now, whatever is committed in the meantime
     test = workspace.views("test")
     history: History | None = None
     if experiment.method == "projection":
@@ -80,7 +81,7 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
         row=experiment.row,
         seed=seed,
         config=_config(experiment, workspace),
-        origin=origin(device),
+        origin=origin(device, revision),
         cost={
             "train_seconds": round(history.seconds if history else 0.0, 1),
             "evaluate_seconds": round(time.monotonic() - trained, 1),

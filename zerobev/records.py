@@ -102,18 +102,23 @@ class RecordStore:
         return self._gallery / f"{key}.npz"
 
 
-def origin(device: str) -> dict[str, Any]:
-    """Where and with what a run is made."""
-    revision = subprocess.run(
+def git_revision() -> str:
+    """The commit of the code, with "-dirty" where it was changed since; "unknown" outside a checkout."""
+    found = subprocess.run(
         ["git", "describe", "--always", "--dirty", "--abbrev=12"],
         cwd=Path(__file__).parent,
         capture_output=True,
         text=True,
         check=False,
     )
+    return found.stdout.strip() or "unknown"
+
+
+def origin(device: str, revision: str) -> dict[str, Any]:
+    """Where and with what a run is made."""
     packages = ("torch", "numpy", "transformers", "accelerate", "embreex", "pyrender", "scikit-image")
     return {
-        "revision": revision.stdout.strip() or "unknown",
+        "revision": revision,
         "python": platform.python_version(),
         "versions": {name: version(name) for name in packages},
         "device": device,
