@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 
 from zerobev.errors import InputError
 from zerobev.learning.metrics import Counts
-from zerobev.records import Record, RecordStore, origin
+from zerobev.records import Record, RecordStore, git_revision, origin
 
 MAPS = np.random.default_rng(0).random((2, 8, 5, 5)) < 0.5
 
@@ -121,7 +121,7 @@ def test_an_interrupted_write_leaves_no_record(tmp_path):
 
 
 def test_origin_says_where_a_number_comes_from():
-    found = origin("cpu")
+    found = origin("cpu", git_revision())
     assert json.loads(json.dumps(found)) == found
     assert found["device"] == "cpu" and set(found["versions"]) > {"torch", "numpy"}
     assert found["revision"] and str(Path.home()) not in json.dumps(found)

@@ -162,7 +162,7 @@ SCALES = {
                 decoder_channels=(32, 48, 64),
                 dropout=0.0,
             ),
-            train=TrainConfig(steps=1200, learning_rate=1.2e-3, decay_every=300, validate_every=200, warmup=30),
+            train=TrainConfig(steps=500, learning_rate=1.2e-3, decay_every=150, validate_every=100, warmup=30),
         ),
         Scale(
             name="paper",
