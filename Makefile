@@ -33,7 +33,7 @@ help: ## list the targets
 # With FRESH=1 every run is computed anyway; otherwise one record is held against a run of today.
 reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper SCENES=dir TEXTURES=dir FRESH=1 SPOT=row]
 	@fresh="$(filter-out 0,$(FRESH))"
-	export $${TEXTURES:+ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"}
+	if [ -n "$$TEXTURES" ]; then export ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"; fi
 	$(PYTHON) -m zerobev.reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${TEXTURES:+--textures "$$TEXTURES"} $${fresh:+--fresh}
 	[ -n "$$fresh" ] || $(PYTHON) -m zerobev.spot_check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \

@@ -23,6 +23,9 @@ COLORS = ("#4c566a", "#c9b79c", "#e07a1f", "#3a7d44", "#2f6db5", "#7cc36e", "#b0
 _NOTHING = "#ececec"
 _OUTSIDE = "#ffffff"
 
+# claims are sentences: a table shows them whole
+pd.set_option("display.max_colwidth", None)
+
 _DRAWS = 1000
 _LEVEL = 0.9
 
