@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from zerobev.errors import InputError
 from zerobev.scenes.glb import placed_meshes, read_glb
 from zerobev.scenes.hm3dsem import FIRST_LINE, read_instances, read_scene, split_scenes
 from zerobev.scenes.hm3dsem_writer import srgb_to_linear, write_dataset_config, write_scene
+from zerobev.scenes.indoor import generate_home
+from zerobev.scenes.indoor.plan import draw_plan
 from zerobev.scenes.scene import Instance, Scene
 
 HOMES = Path(__file__).parents[2] / "shared/scenes/hm3dsem"
@@ -525,3 +529,76 @@ def test_real_homes(folder: Path, tmp_path: Path) -> None:
     for name in ("face_uv", "face_chart", "face_instance"):
         np.testing.assert_array_equal(getattr(back, name), getattr(home, name))
     assert back.instances == home.instances
+
+
+def refined(scene: Scene, cuts: int) -> Scene:
+    """The same surface with every triangle cut into `cuts`^2 ones, in the annotation and in the photograph."""
+    i, j = np.array([(i, j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]).T
+    index = {place: k for k, place in enumerate(zip(i.tolist(), j.tolist()))}
+    upright = [(index[a, b], index[a + 1, b], index[a, b + 1]) for a in range(cuts) for b in range(cuts - a)]
+    turned = [(index[a + 1, b], index[a + 1, b + 1], index[a, b + 1]) for a in range(cuts) for b in range(cuts - 1 - a)]
+    weight, small = np.stack([cuts - i - j, i, j], axis=1).astype(np.float32) / cuts, np.array(upright + turned)
+    vertices = weight @ scene.vertices[scene.faces]
+    uv = weight @ scene.face_uv
+    photograph = trimesh.Scene()
+    for chart, mesh in enumerate(scene.photograph.geometry.values()):
+        on = scene.face_chart == chart
+        faces = len(weight) * np.arange(on.sum())[:, None, None] + small
+        visual = trimesh.visual.TextureVisuals(uv[on].reshape(-1, 2) * [1, -1] + [0, 1], material=mesh.visual.material)
+        cut = trimesh.Trimesh(vertices[on].reshape(-1, 3), faces.reshape(-1, 3), visual=visual, process=False)
+        photograph.add_geometry(cut, geom_name=f"chart{chart}")
+    faces = len(weight) * np.arange(len(scene.faces))[:, None, None] + small
+    return dataclasses.replace(
+        scene,
+        vertices=vertices.reshape(-1, 3),
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        face_uv=uv[:, small].reshape(-1, 3, 2),
+        face_chart=np.repeat(scene.face_chart, len(small)),
+        photograph=photograph,
+    )
+
+
+LOOK = """
+import sys
+from pathlib import Path
+import numpy as np
+from zerobev.config import CameraConfig
+from zerobev.scenes.hm3dsem import read_scene
+from zerobev.sensors.cameras import Pose
+from zerobev.sensors.gbuffer import RayCaster
+from zerobev.sensors.photograph import Photographer
+
+camera, pose = CameraConfig(fpv_px=64, bev_px=40), Pose(*map(float, sys.argv[3:]))
+scene = read_scene(Path(sys.argv[1]))
+caster = RayCaster(scene)
+photograph = Photographer(scene, camera).take(pose)
+status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+peak_kib = int(status["VmHWM"].split()[0])
+seen = {"fpv": caster.fpv(pose, camera).instance, "bev": caster.bev(pose, camera).instance}
+np.savez(sys.argv[2], faces=len(scene.faces), rgb=photograph, peak_kib=peak_kib, **seen)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux to measure peak memory")
+def test_a_million_triangles_fit_into_four_gib(tmp_path: Path) -> None:
+    """A finely cut home is read, cast and photographed in a process of its own, and looks like the plain home."""
+    rng = np.random.default_rng(4)
+    home = generate_home("00000-Home", rng)
+    x0, y0, x1, y1 = draw_plan(np.random.default_rng(4))[0].inner
+    place = ((x0 + x1) / 2, (y0 + y1) / 2, 0.0, 0.4)
+    seen = {}
+    for name, scene in (("plain", home), ("fine", refined(home, 9))):
+        write_scene(tmp_path / name / home.name, scene)
+        out = tmp_path / f"{name}.npz"
+        arguments = [str(tmp_path / name / home.name), str(out), *map(str, place)]
+        subprocess.run([sys.executable, "-c", LOOK, *arguments], check=True, cwd=Path(__file__).parents[1])
+        seen[name] = np.load(out)
+    assert seen["fine"]["faces"] == 81 * len(home.faces) >= 1_000_000
+    assert seen["fine"]["peak_kib"] < 4 * 2**20
+    for sensor in ("fpv", "bev"):
+        assert (seen["fine"][sensor] == seen["plain"][sensor]).mean() > 0.99
+        assert len(np.unique(seen["fine"][sensor])) > 5
+    difference = np.abs(seen["fine"]["rgb"].astype(int) - seen["plain"]["rgb"])
+    assert np.mean(difference.max(axis=-1) <= 8) > 0.97
+    assert seen["fine"]["rgb"].std() > 10

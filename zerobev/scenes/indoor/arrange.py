@@ -90,7 +90,6 @@ def dining(space: Space, sizes: Sequence[int]) -> Placed | None:
         placed = space.in_the_open(_around(rng, table, design, seats, 0.02 if disc else 0.14))
         if placed:
             space.on_top(placed, clutter.ON_TABLES, int(rng.integers(2, 7)))
-            small_plants(space, placed, 0.15)
             if rng.random() < 0.3:
                 (x0, y0, _), (x1, y1, _) = placed.piece.bounds
                 rug = clutter.rug(rng, float(x1 - x0), float(y1 - y0)).moved(0.0, float(y0))
@@ -99,17 +98,18 @@ def dining(space: Space, sizes: Sequence[int]) -> Placed | None:
     return None
 
 
-def island(space: Space) -> None:
-    """A kitchen island with two or three bar chairs at its back."""
+def island(space: Space) -> Placed | None:
+    """A kitchen island with two to four bar chairs at its back."""
     rng = space.rng
     block = storage.kitchen_island(rng)
     items, seed = list(block.items), int(rng.integers(2**32))
     width = float(block.bounds[1, 0])
-    for x in np.linspace(-width, width, 2 * int(rng.integers(2, 4)) + 1)[1::2]:
+    for x in np.linspace(-width, width, 2 * round(width / 0.28) + 1)[1::2]:
         chair = seating.bar_chair(np.random.default_rng(seed))
         items += chair.moved(float(x), 0.15 - float(chair.bounds[1, 1])).items
     placed = space.in_the_open(Piece(items, block.tops))
     space.on_top(placed, clutter.ON_TABLES, 4)
+    return placed
 
 
 def lounge(space: Space) -> Placed | None:
@@ -198,29 +198,44 @@ def standing_lamp(space: Space) -> None:
         _shine(space, placed, float(placed.piece.bounds[1, 2]) + 0.08, 0.5)
 
 
-def _number(rng: np.random.Generator, mean: float) -> int:
-    """A whole number with this mean."""
-    return int(mean) + int(rng.random() < mean % 1)
+def company(rng: np.random.Generator, share: float, mean: float) -> int:
+    """How many of a thing a room has: none, or in `share` of rooms one or more, so that the mean is `mean`."""
+    return int(rng.random() < share) * (1 + int(rng.poisson(mean / share - 1)))
 
 
-def standing_plants(space: Space, mean: float, designs: Sequence[Design] = plants.STANDING) -> None:
-    """Plants on the floor, in corners or along walls."""
-    for _ in range(_number(space.rng, mean)):
-        first(space, designs, corner=True, front=0.0) or first(space, designs, front=0.0)
-
-
-def small_plants(space: Space, placed: Placed | None, mean: float) -> None:
-    """Plants on a table or a worktop."""
-    space.on_top(placed, plants.SMALL, _number(space.rng, mean))
-
-
-def hanging_plant(space: Space, chance: float) -> None:
-    """A plant under the ceiling, near a corner."""
+def greenery(space: Space, share: float, mean: float, *low: Placed | None) -> None:
+    """Plants, in company (`company`): on the floor, on the tops of `low`, under the ceiling."""
     rng = space.rng
-    if rng.random() < chance:
+
+    def standing() -> object:
+        return first(space, plants.STANDING, corner=True, front=0.0) or first(space, plants.STANDING, front=0.0)
+
+    def small() -> object:
+        return low and space.on_top(low[rng.integers(len(low))], plants.SMALL, 1)
+
+    def hanging() -> object:
         x0, y0, x1, y1 = space.room.inner
         x, y = rng.choice([x0 + 0.4, x1 - 0.4]), rng.choice([y0 + 0.3, y1 - 0.6])
-        space.put(Placed(plants.hanging_plant(rng), float(x), float(y), 0.0), z=space.room.height)
+        return space.put(Placed(plants.hanging_plant(rng), float(x), float(y), 0.0), z=space.room.height)
+
+    for _ in range(company(rng, share, mean)):
+        ways = (standing, small, hanging, small)
+        start = rng.choice(3, p=(0.5, 0.35, 0.15))
+        any(way() for way in ways[start:] + ways[:start])
+
+
+def seats(space: Space, share: float, mean: float, designs: Sequence[Design]) -> None:
+    """Single chairs along the walls, in company (`company`)."""
+    for _ in range(company(space.rng, share, mean)):
+        first(space, designs, corner=space.rng.random() < 0.5, front=0.1)
+
+
+def breast(space: Space) -> None:
+    """A chimney breast or boxed pipes: a piece of wall that stands out, and is annotated on its own."""
+    rng = space.rng
+    w, d, skin = rng.uniform(0.3, 1.1), rng.uniform(0.12, 0.35), surfaces.wall(rng, space.room.kind)
+    solid = Solid().box((-w / 2, w / 2), (0, d), (0, space.room.height - 0.002), skin, hide="btu")
+    space.against_wall(Piece([("wall", solid)]), gap=0.006, front=0.2)
 
 
 def on_walls(space: Space, low: int, high: int) -> None:

@@ -32,6 +32,15 @@ class Home:
     materials: list[Material]  #: Q
     lamps: list[Lamp]
 
+    @property
+    def instances(self) -> tuple[Instance, ...]:
+        """One row an instance; colours run through a fixed permutation of 24-bit numbers, so they are unique."""
+        rows = []
+        for index, (name, region) in enumerate(zip(self.names, self.regions), start=1):
+            code = index * 0x9E3779 % 0x1000000  # odd factor: a bijection, 0 stays 0
+            rows.append(Instance(index, (code >> 16, code >> 8 & 255, code & 255), name, region, label_of(name)))
+        return tuple(rows)
+
 
 def build_home(rng: np.random.Generator) -> Home:
     """A furnished floor plan."""
@@ -70,7 +79,7 @@ def generate_home(name: str, rng: np.random.Generator) -> Scene:
     atlas = unwrap(quads, home.hidden)
     faces, quad_of_face, corner = _triangles(quads)
     size_m = np.stack([np.ptp(atlas.corners[:, :, axis], axis=1) for axis in (1, 0)], axis=1) / TEXELS_PER_M
-    albedo = np.array([np.mean([m.color, m.second], axis=0) for m in home.materials]) ** 2
+    albedo = np.array([(m.color, m.second) for m in home.materials]).mean(axis=1) ** 2
     opaque = np.array([not m.glow for m in home.materials])
     light = bake(quads, atlas.origin, atlas.right, atlas.down, size_m, faces, albedo, home.lamps, home.hidden, opaque)
     textures = paint(atlas, home.hidden, home.materials, light)
@@ -84,7 +93,7 @@ def generate_home(name: str, rng: np.random.Generator) -> Scene:
         face_uv=face_uv,
         face_chart=face_chart,
         chart_instance=atlas.owner_images(home.owner),
-        instances=_instances(home),
+        instances=home.instances,
         photograph=_photograph(atlas, vertices, faces, face_chart, textures),
         unlit=True,
         double_sided=False,
@@ -100,15 +109,6 @@ def _triangles(quads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     keep[1::2] = ~is_triangle
     quad, corner = quad[keep], corner[keep]
     return (quad[:, None] * 4 + corner).astype(np.int32), quad, corner
-
-
-def _instances(home: Home) -> tuple[Instance, ...]:
-    """One row an instance; colours run through a fixed permutation of 24-bit numbers, so they are unique."""
-    rows = []
-    for index, (name, region) in enumerate(zip(home.names, home.regions), start=1):
-        code = index * 0x9E3779 % 0x1000000  # odd factor: a bijection, 0 stays 0
-        rows.append(Instance(index, (code >> 16, code >> 8 & 255, code & 255), name, region, label_of(name)))
-    return tuple(rows)
 
 
 def _photograph(

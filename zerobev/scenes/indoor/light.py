@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 #: Side of a cell of the light map, metres.
-CELL_M = 0.13
+CELL_M = 0.14
 #: Directions in which each cell looks for light of other surfaces.
 DIRECTIONS = 8
 #: Light weaker than this (where 1 is well lit) casts no shadow ray.

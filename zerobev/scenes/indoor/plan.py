@@ -11,10 +11,16 @@ HEAD_M = 1.98
 #: Free floor before a door for another one's leaf to stand clear of, metres.
 _LANDING_M = 0.95
 #: Kinds of rooms, from the one that gets the most area to the one that gets the least.
-KINDS = ("living room", "dining room", "bedroom", "kitchen", "office", "hall", "bathroom")
+KINDS = ("living room", "dining room", "kitchen", "bedroom", "office", "hall", "bathroom", "laundry room", "closet")
 _SOCIAL = ("living room", "dining room", "kitchen", "hall")
 _FIRST = ("living room", "kitchen", "bathroom", "bedroom")
-_LATER = {"bedroom": 0.3, "bathroom": 0.25, "hall": 0.2, "dining room": 0.13, "office": 0.12}
+#: What the other rooms are; these weights make chairs, beds, toilets, ... as common as in HM3DSem's rooms.
+_LATER = {
+    "bedroom": 0.22, "bathroom": 0.15, "hall": 0.2, "dining room": 0.08, "office": 0.11, "closet": 0.14,
+    "laundry room": 0.1,
+}  # fmt: skip
+#: How often a home has 4, 5, ..., 10 rooms.
+_COUNTS = (0.05, 0.08, 0.12, 0.17, 0.2, 0.2, 0.18)
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1, metres
 
@@ -52,7 +58,7 @@ class Room:
 def draw_plan(rng: np.random.Generator) -> list[Room]:
     """A home of 4 to 10 rooms; every room can be reached from every other one through doors."""
     while True:
-        rectangles, footprint = _split(rng, int(rng.integers(4, 11)))
+        rectangles, footprint = _split(rng, int(rng.choice(np.arange(4, 11), p=_COUNTS)))
         rooms = _rooms(rng, rectangles, footprint)
         doors = _doors(rng, rooms)
         if doors is not None:
@@ -126,7 +132,7 @@ def _without_clashes(room: Room) -> list[Opening]:
 
 def _split(rng: np.random.Generator, count: int) -> tuple[list[Rectangle], Rectangle]:
     """Cut a rectangle into `count` ones of at least 1.9 m; larger homes often have a corridor."""
-    area = count * rng.uniform(9.5, 13.0)
+    area = count * rng.uniform(10.5, 14.0)
     width = np.sqrt(area * rng.uniform(1.0, 1.8))
     footprint = (0.0, 0.0, float(width), float(area / width))
     pieces, done = [footprint], []
@@ -183,7 +189,7 @@ def _shared(a: Room, b: Room) -> tuple[int, float, float] | None:
 
 def _doors(rng: np.random.Generator, rooms: list[Room]) -> list[tuple[int, int, int, float, float]] | None:
     """A spanning tree of doors that keeps bathrooms and bedrooms at its leaves, and some more between social rooms."""
-    dislike = {"bathroom": 4.0, "bedroom": 1.5, "office": 1.0, "hall": -1.0}
+    dislike = {"bathroom": 4.0, "closet": 4.0, "laundry room": 3.0, "bedroom": 1.5, "office": 1.0, "hall": -1.0}
     pairs = []
     for i, a in enumerate(rooms):
         for j, b in enumerate(rooms[:i]):
@@ -213,7 +219,7 @@ def _windows(rng: np.random.Generator, room: Room) -> list[Opening]:
         start, end = room.inner[axis], room.inner[axis + 2]
         if windows and room.kind == "kitchen":
             break
-        if not room.outside[side] or end - start < 1.2 or rng.random() < 0.25:
+        if not room.outside[side] or end - start < 1.2 or rng.random() < (0.8 if room.kind == "closet" else 0.2):
             continue
         parts = 2 if end - start > 4.2 and room.kind != "kitchen" and rng.random() < 0.6 else 1
         sill = 1.2 if room.kind == "bathroom" else float(rng.choice([0.08, 0.5, 0.85, 0.95], p=[0.12, 0.13, 0.35, 0.4]))

@@ -26,7 +26,8 @@ def build_shell(rng: np.random.Generator, room: Room) -> tuple[list[Item], list[
     for side in range(4):
         origin, yaw, length = side_frame(room, side)
         openings = sorted((*along(room, o), o) for o in room.openings if o.side == side)
-        items.append(("wall", Solid().join(_wall(room, side, length, openings, wall, trim), origin, yaw)))
+        for part in _walls(room, side, length, openings, wall, trim):
+            items.append(("wall", Solid().join(part, origin, yaw)))
         for start, end, opening in openings:
             if opening.window:
                 items.append(("window", Solid().join(_window(rng, start, end, opening.sill, trim), origin, yaw)))
@@ -46,23 +47,27 @@ def _ceiling(room: Room, material: Material) -> Solid:
     return solid
 
 
-def _wall(room: Room, side: int, length: float, openings: list, wall: Material, trim: Material) -> Solid:
-    """A beam above the openings' heads and pieces between the openings, down to the floor, with skirting."""
+def _walls(room: Room, side: int, length: float, openings: list, wall: Material, trim: Material) -> list[Solid]:
+    """The wall of one side, as annotators split it: from each opening's end to the next one's, with skirting.
+
+    The part before an opening has the lintel over it, and the parapet below it if it is a window.
+    """
     depth = OUTER_M if room.outside[side] else INNER_M
     before = OUTER_M if room.outside[side - 1] else INNER_M  # walls 1 and 3 stand between 0 and 2
     after = OUTER_M if room.outside[(side + 1) % 4] else INNER_M
     first, last = (-before, length + after) if side in (0, 2) else (0.0, length)
-    solid = Solid().box((first, last), (-depth, 0.0), (HEAD_M, room.height), wall, hide="brl")
-    at = first
+    parts, at = [], first
     for start, end, opening in [*openings, (last, last, None)]:
-        hide = "b" + "l" * (at == first) + "r" * (start == last)
-        solid.box((at, start), (-depth, 0.0), (0.0, HEAD_M), wall, hide=hide)
-        _skirting(solid, max(at, 0.0), min(start, length), trim)
+        hide = "bt" + "l" * (at == first) + "r" * (start == last)
+        part = Solid().box((at, start), (-depth, 0.0), (0.0, HEAD_M), wall, hide=hide)
+        part.box((at, end), (-depth, 0.0), (HEAD_M, room.height), wall, hide="brl")
+        _skirting(part, max(at, 0.0), min(start, length), trim)
         if opening is not None and opening.window:
-            solid.box((start, end), (-depth, 0.0), (0.0, opening.sill), wall, hide="blr")
-            _skirting(solid, start, end, trim)
+            part.box((start, end), (-depth, 0.0), (0.0, opening.sill), wall, hide="blr")
+            _skirting(part, start, end, trim)
+        parts.append(part)
         at = end
-    return solid
+    return parts
 
 
 def _skirting(solid: Solid, start: float, end: float, trim: Material) -> None:

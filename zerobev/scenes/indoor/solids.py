@@ -112,9 +112,10 @@ class Solid:
         """A thin folded leaf (a flat tetrahedron) from `base` to `tip`, `width` metres wide."""
         base, tip = np.asarray(base, float), np.asarray(tip, float)
         along = tip - base
-        side = np.cross(along, [0.0, 0, 1]) if np.hypot(*along[:2]) > 1e-6 else np.array([1.0, 0, 0])
+        x, y, z = along.tolist()
+        side = np.array([y, -x, 0.0] if math.hypot(x, y) > 1e-6 else [1.0, 0.0, 0.0])  # level, across the leaf
         side *= width / 2 / np.linalg.norm(side)
-        lift = np.cross(side, along)
+        lift = np.array([side[1] * z, -side[0] * z, side[0] * y - side[1] * x])  # side x along
         middle = base + 0.45 * along + lift * (0.25 * width / np.linalg.norm(lift))
         left, right = middle - side, middle + side
         faces = np.array([[tip, base, left], [base, tip, right], [left, right, tip], [right, left, base]])

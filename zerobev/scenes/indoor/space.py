@@ -60,6 +60,7 @@ class Space:
         self.used_m2 = 0.0
         self._rectangles: list[Rectangle] = []
         self._on_wall: list[tuple[int, float, float, float, float]] = []  # side, start, end, low, high
+        self._on_tops: list[tuple[Top, Rectangle]] = []
         x0, y0, x1, y1 = room.inner
         shape = (int((x1 - x0) / _CELL_M), int((y1 - y0) / _CELL_M))
         self._walkable = np.zeros(shape, bool)
@@ -151,14 +152,14 @@ class Space:
         """Stand a piece with its back to a wall, not before a window that it would cover."""
         (x0, _, _), (x1, _, _) = piece.bounds
         for _ in range(_TRIES):
-            side = int(self.rng.choice(sides))
+            side = sides[self.rng.integers(len(sides))]
             length = side_frame(self.room, side)[2]
             low, high = margin - x0, length - margin - x1
             if high < low:
                 continue
             t = self.rng.uniform(low, high)
             if corner:
-                t = float(self.rng.choice([low, high]))
+                t = float((low, high)[self.rng.integers(2)])
             elif middle:
                 t = (low + high) / 2 + 0.2 * (t - (low + high) / 2)
             placed = self.at_wall(piece, side, t, gap=gap, front=front)
@@ -244,7 +245,6 @@ class Space:
     def on_top(self, placed: Placed | None, designs: Sequence[Design], count: int, z: float = 0.0) -> list[Placed]:
         """Stand up to `count` small pieces on the tops of a placed one (raised by `z`), side by side."""
         done: list[Placed] = []
-        taken: list[tuple[Top, float, float, float, float]] = []
         if placed is None or not placed.piece.tops:
             return done
         for _ in range(count):
@@ -257,11 +257,8 @@ class Space:
                 x = self.rng.uniform(top.x[0] - x0, top.x[1] - x1)
                 y = self.rng.uniform(top.y[0] - y0, top.y[1] - y1)
                 box = (x + x0, y + y0, x + x1, y + y1)
-                if all(
-                    t is not top or box[2] < u0 or box[0] > u1 or box[3] < v0 or box[1] > v1
-                    for t, u0, v0, u1, v1 in taken
-                ):
-                    taken.append((top, *box))
+                if not any(other is top and overlap(box, there) for other, there in self._on_tops):
+                    self._on_tops.append((top, box))
                     wx, wy = placed.to_world(x, y)
                     self.items += piece.moved(wx, wy, top.z + z + 0.001, placed.yaw).items
                     done.append(Placed(piece, wx, wy, placed.yaw))

@@ -192,7 +192,7 @@ def stone(rng: np.random.Generator) -> Material:
 
 def vivid(rng: np.random.Generator) -> Material:
     """Books, toys, boxes, bottles."""
-    return two_tone("plain", _hsv(rng.random(), rng.uniform(0.3, 0.9), rng.uniform(0.3, 0.95)), 0.85)
+    return two_tone("plain", _hsv(rng.random(), rng.uniform(0.15, 0.8), rng.uniform(0.3, 0.95)), 0.85)
 
 
 def foliage(rng: np.random.Generator) -> Material:

@@ -30,13 +30,20 @@ def _crown(
         solid.leaf(base, base + reach * direction, width * rng.uniform(0.8, 1.2), leaf)
 
 
+def _potted(
+    rng: np.random.Generator, r: float, h: float, count: tuple[int, int], length: tuple[float, float],
+    rise: tuple[float, float], slender: float,
+) -> Piece:  # fmt: skip
+    """A pot and one crown of leaves, which are `slender` times as long as they are wide."""
+    solid, size = Solid(), rng.uniform(*length)
+    _pot(rng, solid, r, h)
+    _crown(rng, solid, (0, r, h - 0.02), int(rng.integers(*count)), size, surfaces.foliage(rng), rise, size / slender)
+    return one("potted plant", solid)
+
+
 def bushy_plant(rng: np.random.Generator) -> Piece:
     """Many broad leaves from one pot."""
-    solid, r, h = Solid(), rng.uniform(0.11, 0.2), rng.uniform(0.18, 0.4)
-    _pot(rng, solid, r, h)
-    leaf, size = surfaces.foliage(rng), rng.uniform(0.3, 0.55)
-    _crown(rng, solid, (0, r, h), int(rng.integers(16, 28)), size, leaf, (0.35, 1.4), size * 0.35)
-    return one("potted plant", solid)
+    return _potted(rng, rng.uniform(0.11, 0.2), rng.uniform(0.18, 0.4), (16, 28), (0.3, 0.55), (0.35, 1.4), 2.9)
 
 
 def tall_plant(rng: np.random.Generator) -> Piece:
@@ -52,19 +59,7 @@ def tall_plant(rng: np.random.Generator) -> Piece:
 
 def snake_plant(rng: np.random.Generator) -> Piece:
     """Stiff upright blades."""
-    solid, r, h = Solid(), rng.uniform(0.1, 0.16), rng.uniform(0.15, 0.3)
-    _pot(rng, solid, r, h)
-    _crown(
-        rng,
-        solid,
-        (0, r, h - 0.03),
-        int(rng.integers(9, 16)),
-        rng.uniform(0.45, 0.8),
-        surfaces.foliage(rng),
-        (1.15, 1.5),
-        0.08,
-    )
-    return one("potted plant", solid)
+    return _potted(rng, rng.uniform(0.1, 0.16), rng.uniform(0.15, 0.3), (9, 16), (0.45, 0.8), (1.15, 1.5), 7.5)
 
 
 def small_tree(rng: np.random.Generator) -> Piece:
@@ -81,19 +76,7 @@ def small_tree(rng: np.random.Generator) -> Piece:
 
 def table_plant(rng: np.random.Generator) -> Piece:
     """Something small and green for a table or a sill."""
-    solid, r, h = Solid(), rng.uniform(0.05, 0.08), rng.uniform(0.08, 0.13)
-    _pot(rng, solid, r, h)
-    _crown(
-        rng,
-        solid,
-        (0, r, h),
-        int(rng.integers(8, 14)),
-        rng.uniform(0.12, 0.22),
-        surfaces.foliage(rng),
-        (0.4, 1.4),
-        0.06,
-    )
-    return one("potted plant", solid)
+    return _potted(rng, rng.uniform(0.05, 0.08), rng.uniform(0.08, 0.13), (8, 14), (0.12, 0.22), (0.4, 1.4), 2.8)
 
 
 def bouquet(rng: np.random.Generator) -> Piece:
