@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy import ndimage
@@ -49,17 +48,19 @@ def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) 
         raise InputError(f"scene {scene.name}: expected a horizontal face of class floor, found none")
     low = corner[floor].min(axis=(0, 1))[:2]
     shape = tuple(np.ceil((corner[floor].max(axis=(0, 1))[:2] - low) / agent.grid_m).astype(int) + 1)
-    obstacles = _surface_samples(scene, ~floor, rng)
-    obstacle_cell = np.floor((obstacles[:, :2] - low) / agent.grid_m).astype(int)
-    inside = ((obstacle_cell >= 0) & (obstacle_cell < shape)).all(axis=1)
-    obstacles, obstacle_cell = obstacles[inside, 2], obstacle_cell[inside]
+    lowest, highest = corner[floor][..., 2].min() + agent.climb_m, corner[floor][..., 2].max() + agent.height_m
+    in_the_way = ~floor & (corner[..., 2].max(axis=1) > lowest) & (corner[..., 2].min(axis=1) < highest)
+    x, y, z = _surface_samples(corner[in_the_way], rng)
+    i, j = (((axis - start) / agent.grid_m).astype(np.float32) for axis, start in zip((x, y), low))
+    inside = np.flatnonzero((i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]))
+    obstacle_m = z.take(inside)
+    obstacle_cell = i.take(inside).astype(np.intp) * shape[1] + j.take(inside).astype(np.intp)
 
     cells = []
     for height in _storeys(scene, floor, low, shape, agent):
-        above = obstacles - height[*obstacle_cell.T]
-        hit = (above > agent.climb_m) & (above < agent.height_m)
+        above = obstacle_m - height.ravel().take(obstacle_cell)
         free = np.isfinite(height)
-        free[*obstacle_cell[hit].T] = False
+        free.ravel()[obstacle_cell[(above > agent.climb_m) & (above < agent.height_m)]] = False
         # the axis keeps the radius from everything that is not free, the border of the grid included
         room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * agent.grid_m > agent.radius_m
         patch, count = ndimage.label(room)
@@ -72,14 +73,17 @@ def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) 
     return NavigableFloor(found, agent.grid_m)
 
 
-def _surface_samples(scene: Scene, keep: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(N, 3) points drawn uniformly on the faces `keep`."""
-    mesh = trimesh.Trimesh(scene.vertices, scene.faces[keep], process=False)
-    if mesh.area == 0:
-        return np.zeros((0, 3))
-    count = int(mesh.area * _SAMPLES_PER_M2)
-    points, _ = trimesh.sample.sample_surface(mesh, count, seed=rng)
-    return np.asarray(points)
+def _surface_samples(corner: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """x, y and z, float32, of points drawn uniformly on each of the triangles `corner` (F, 3, 3)."""
+    edge = corner[:, 1:] - corner[:, :1]
+    area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
+    face = np.repeat(np.arange(len(corner)), np.ceil(area * _SAMPLES_PER_M2).astype(int))
+    a, b = rng.random((2, len(face)), np.float32)
+    beyond = a + b > 1  # the other half of the parallelogram is turned back onto the triangle
+    a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
+    sides = np.stack([corner[:, 0], edge[:, 0], edge[:, 1]]).astype(np.float32)
+    start, first, second = (side.T for side in sides)
+    return tuple(start[k].take(face) + a * first[k].take(face) + b * second[k].take(face) for k in range(3))
 
 
 def _storeys(
