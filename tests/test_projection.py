@@ -1,5 +1,7 @@
 """P^-1 against a closed form and a naive voxel grid; the field of view against scikit-image's convex hull."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -65,10 +67,10 @@ def random_view(seed: int, camera: CameraConfig, batch: int = 2, modalities: int
     return torch.from_numpy(zero).double(), torch.from_numpy(depth)
 
 
-def voxel_projection(zero: np.ndarray, depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
-    """The paper's way: count white points in 100 voxels of height, sum over height, threshold at zero."""
+def voxel_projection(zero: np.ndarray, depth: np.ndarray, camera: CameraConfig, side: int) -> np.ndarray:
+    """The paper's way: count white points in side x side x 100 voxels, sum over height, threshold at zero."""
     batch, modalities, height, width = zero.shape
-    side, levels = camera.bev_px, 100
+    levels = 100
     maps = np.zeros((batch, modalities, side, side), bool)
     for b in range(batch):
         for k in range(modalities):
@@ -94,7 +96,29 @@ def voxel_projection(zero: np.ndarray, depth: np.ndarray, camera: CameraConfig) 
 @settings(max_examples=10)
 def test_projection_is_counting_in_voxels(seed):
     zero, depth = random_view(seed, CAMERA)
-    assert np.array_equal(project(zero, depth, CAMERA).numpy(), voxel_projection(zero.numpy(), depth.numpy(), CAMERA))
+    voxels = voxel_projection(zero.numpy(), depth.numpy(), CAMERA, side=20)
+    assert np.array_equal(project(zero, depth, CAMERA).numpy(), voxels)
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_voxels_of_five_centimetres_make_no_difference_where_cells_are_whole_voxels(seed):
+    """100^3 voxels, pooled to the map: equal at 20 x 20; at 40 x 40 those that lie within a cell agree."""
+    zero, depth = random_view(seed, CAMERA)
+    fine = voxel_projection(zero.numpy(), depth.numpy(), CAMERA, side=100)
+    pooled = fine.reshape(2, 3, 20, 5, 20, 5).max(axis=(3, 5))
+    assert np.array_equal(project(zero, depth, CAMERA).numpy(), pooled)
+
+    finer = replace(CAMERA, bev_px=40)
+    cell_of_voxel = (np.arange(100) + 0.5) * 40 / 100
+    whole = np.floor(cell_of_voxel - 0.2 + 1e-9) == np.floor(cell_of_voxel + 0.2 - 1e-9)
+    assert whole.sum() == 80
+    direct, pooled = project(zero, depth, finer).numpy(), np.zeros((2, 3, 40, 40))
+    for row in np.flatnonzero(whole):
+        for column in np.flatnonzero(whole):
+            cell = pooled[..., int(cell_of_voxel[row]), int(cell_of_voxel[column])]
+            np.maximum(cell, fine[..., row, column], out=cell)
+    assert (pooled <= direct).all()  # what lies in whole voxels is there
 
 
 @given(SEEDS)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy import ndimage
 from scipy.spatial.distance import cdist
+from scipy.stats import kstest
 from skimage.feature import local_binary_pattern
 
 from zerobev.config import TextureConfig
@@ -20,7 +21,7 @@ from zerobev.streams.textures import (
     TextureDraw,
     dilate,
     kernel_runs,
-    modsem_texture,
+    modsem_textures,
     opened_structures,
     opening,
     random_rectangles,
@@ -59,6 +60,18 @@ def test_dilation_and_opening_agree_with_scipy(shape, size, wrap, seed):
     dense = ~(mask & (np.arange(31) > 12))  # with room for the largest kernel
     expected = ndimage.binary_opening(np.tile(dense, (3, 3)), kernel)[23:46, 31:62]
     assert np.array_equal(opening(dense, kernel_runs(shape, size)), expected)
+
+
+@given(st.sampled_from(KERNELS), st.integers(1, 150), st.sampled_from([63, 64, 65, 200]), seeds)
+@settings(max_examples=20, deadline=None)
+def test_dilation_by_kernels_wider_than_a_machine_word(shape, size, columns, seed):
+    mask = np.random.default_rng(seed).random((150, columns)) < 0.0005
+    runs = kernel_runs(shape, size)
+    spread = np.zeros((150 + size, columns + size), bool)
+    for row, column in np.argwhere(mask):
+        spread[row : row + size, column : column + size] |= footprint(runs)
+    corner = size // 2
+    assert np.array_equal(dilate(mask, runs, False), spread[corner : corner + 150, corner : corner + columns])
 
 
 def test_kernels_have_their_shape():
@@ -191,7 +204,7 @@ def naive(bank: TextureBank, draw: TextureDraw, chart: int, row: int, column: in
 @settings(max_examples=15, deadline=None)
 def test_look_up_is_its_definition(bank, seed, scale):
     rng = np.random.default_rng(seed)
-    draw = bank.draw(rng, 5, scale)
+    draw = replace(bank.draw(rng, 5), scale=scale)
     texels = np.stack([rng.integers(-1, 5, (9, 31)), *rng.integers(0, 3000, (2, 9, 31))], axis=-1).astype(np.int16)
     values = bank.look_up(texels, draw)
     assert values.shape == (9, 31) and values.dtype == bool
@@ -213,8 +226,39 @@ def test_every_orientation_and_tile_is_drawn_and_charts_differ(bank):
     assert set(draw.tile) == {0, 1, 2, 3}
     assert len({(t, *f) for t, f in zip(draw.transpose.tolist(), draw.flip.tolist())}) == 8
     assert 100 < draw.offset.mean() < 156 and draw.offset.min() >= 0 and draw.offset.max() < 256
-    with pytest.raises(InputError, match="scale"):
-        bank.draw(np.random.default_rng(0), 1, scale=0.5)
+
+
+def scaled(bank: TextureBank, low: float, high: float) -> TextureBank:
+    return TextureBank(bank.tiles, replace(bank.config, scales=(low, high)))
+
+
+def test_scales_are_log_uniform_and_drawn_for_each_texture(bank):
+    rng = np.random.default_rng(1)
+    scales = [scaled(bank, 1, 5).draw(rng, 1).scale for _ in range(500)]
+    assert kstest(np.log(scales) / np.log(5), "uniform").pvalue > 0.05
+    assert kstest((np.array(scales) - 1) / 4, "uniform").pvalue < 1e-6  # which is not uniform
+    assert {scaled(bank, 2, 2).draw(rng, 1).scale for _ in range(9)} == {2}
+    assert {bank.draw(rng, 1).scale for _ in range(9)} == {1}
+    for low, high in (0.5, 2), (3, 2):
+        with pytest.raises(InputError, match=f"scales: expected 1 <= low <= high, found {low} and {high}"):
+            scaled(bank, low, high).draw(rng, 1)
+
+
+@pytest.mark.parametrize("scale", [2, 3.5, 5])
+def test_structures_shrink_by_the_scale(bank, scale):
+    """Mean length of the white runs along rows, over many charts; the share of white stays."""
+    rows, columns = np.mgrid[:64, :1500]
+    runs, shares = [], []
+    for low in (1, scale):
+        draw = scaled(bank, low, low).draw(np.random.default_rng(5), 30)
+        white = np.stack(
+            [bank.look_up(np.stack([0 * rows + c, rows, columns], -1).astype(np.int16), draw) for c in range(30)]
+        )
+        starts = white[..., 1:] & ~white[..., :-1]
+        runs.append(white.sum() / starts.sum())
+        shares.append(white.mean())
+    assert runs[0] / runs[1] == pytest.approx(scale, rel=0.1)
+    assert shares[0] == pytest.approx(shares[1], abs=0.03)
 
 
 def test_textures_are_independent_of_any_fixed_image(bank):
@@ -233,30 +277,55 @@ def test_textures_are_independent_of_any_fixed_image(bank):
 # --- Mod. Sem. and Depth proj.
 
 
-@given(seeds)
-@settings(max_examples=8, deadline=None)
-def test_modsem_erodes_the_objects_to_the_share(seed):
-    rng = np.random.default_rng(seed)
+def things(rng: np.random.Generator, gap: int) -> np.ndarray:
+    """A chart of rectangles, `gap` texels apart at least, in four rows."""
     instances = np.zeros((240, 300), np.uint16)
     for i, (row, column) in enumerate(np.mgrid[0:240:80, 0:300:75].reshape(2, -1).T):
-        instances[row + 2 : row + 78, column + 2 : column + rng.integers(55, 73)] = i + 1
-    share = SHARES[rng.integers(5)]
-    texture = modsem_texture(instances, replace(SMALL, share=share), rng)
-    assert texture.dtype == bool and texture.shape == instances.shape
-    assert not texture[instances == 0].any()
-    assert abs(texture.mean() - share) < 0.0001
-    assert opening(texture, kernel_runs("square", 3)).sum() > 0.98 * texture.sum()
+        width = rng.integers(55, 73) if gap else 75
+        instances[row + gap : row + 80 - gap, column + gap : column + gap + width] = i + 1
+    return instances
+
+
+@given(seeds, st.sampled_from(SHARES), st.sampled_from([0, 2]))
+@settings(max_examples=10, deadline=None)
+def test_modsem_erodes_the_objects_to_the_share(seed, share, gap):
+    rng = np.random.default_rng(seed)
+    instances = things(rng, gap)
+    textures = modsem_textures(instances, replace(SMALL, modsem_share=share), rng, draws=3)
+    assert textures.dtype == bool and textures.shape == (3, *instances.shape)
+    assert len({texture.tobytes() for texture in textures}) == 3
+    for texture in textures:
+        assert not texture[instances == 0].any()
+        assert abs(texture[instances > 0].mean() - share) < 0.0002  # of what is covered, not of the chart
+        assert opening(texture, kernel_runs("square", 3)).sum() > 0.98 * texture.sum()
+        labels, count = ndimage.label(texture, np.ones((3, 3)))  # no two objects touch
+        whites = [np.unique(instances[labels == label]) for label in range(1, count + 1)]
+        assert all(len(ids) == 1 for ids in whites)
 
 
 def test_modsem_of_charts_without_and_with_nothing_but_objects():
     rng = np.random.default_rng(0)
-    full = modsem_texture(np.ones((100, 200), np.uint16), SMALL, rng)
-    assert abs(full.mean() - SMALL.share) < 0.001
-    assert full[50, 100] and not full[0].any()  # what is left is the middle
+    for full in modsem_textures(np.ones((100, 200), np.uint16), SMALL, rng):
+        assert abs(full.mean() - SMALL.modsem_share) < 0.001
+        assert full[50, 100] and not full[0].any()  # what is left is the middle
     few = np.zeros((100, 100), np.uint16)
     few[40:50, 40:50] = 7
-    assert np.array_equal(modsem_texture(few, SMALL, rng), few > 0)
-    assert not modsem_texture(np.zeros((50, 60), np.uint16), SMALL, rng).any()
+    assert np.array_equal(modsem_textures(few, replace(SMALL, modsem_share=1.0), rng, draws=1)[0], few > 0)
+    assert not modsem_textures(np.zeros((50, 60), np.uint16), SMALL, rng).any()
+
+
+def test_modsem_lies_between_two_erosions_of_each_object():
+    rng = np.random.default_rng(4)
+    instances = things(rng, 0)
+    config = replace(SMALL, kernel_px=(12, 12), modsem_share=0.55)  # one erosion leaves 70 %, two leave 50 %
+    objects = [np.pad(instances == i, 1) for i in range(1, 13)]
+    once, twice = (
+        np.any([ndimage.binary_erosion(one, np.ones((side, side))) for one in objects], axis=0)[1:-1, 1:-1]
+        for side in (11, 26)
+    )
+    for texture in modsem_textures(instances, config, rng):
+        assert once[texture].all() and texture[twice].all()
+        assert twice.mean() < 0.5 < once.mean()
 
 
 def test_random_rectangles():

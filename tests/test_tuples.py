@@ -1,5 +1,6 @@
 """Streams of tuples: functions of seed and step, aligned by the same texels, blind to what the scene means."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,28 @@ from scenes_for_tests import build, furnished, room
 from scipy import ndimage
 
 from zerobev.config import LABELS, CameraConfig, TextureConfig
+from zerobev.errors import InputError
+from zerobev.streams.projection import project
 from zerobev.streams.shards import Shard, write_shard
-from zerobev.streams.textures import TextureBank
-from zerobev.streams.tuples import SynthTuples, ViewSet, collate, semantic_batches, semantic_sample, view_sample
+from zerobev.streams.textures import MODSEM_DRAWS, TextureBank
+from zerobev.streams.tuples import (
+    DepthProjTuples,
+    ModSemTuples,
+    SemanticTuples,
+    SynthTuples,
+    TupleStream,
+    ViewSet,
+    collate,
+    semantic_batches,
+    semantic_sample,
+    view_sample,
+)
 from zerobev.streams.views import View, ViewSource
 
 CAMERA = CameraConfig(fpv_px=24, bev_px=20)
+TEXTURE = TextureConfig(tiles=4)
 COUNTS = (5, 3)
+STREAMS = ("synth", "paper", "modsem", "depth", "semantic")
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +39,7 @@ def bank() -> TextureBank:
     """Blobs of some 15 texels, 20 % white."""
     noise = np.random.default_rng(0).standard_normal((4, 128, 128))
     smooth = np.array([ndimage.gaussian_filter(tile, 5, mode="wrap") for tile in noise])
-    return TextureBank(smooth > np.quantile(smooth, 0.8, axis=(1, 2), keepdims=True), TextureConfig(tiles=4))
+    return TextureBank(smooth > np.quantile(smooth, 0.8, axis=(1, 2), keepdims=True), TEXTURE)
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +47,29 @@ def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("shards")
     for number, (things, count) in enumerate(zip((furnished(), room((6, 4, 2.5))), COUNTS)):
         scene = build(things, name=f"scene{number}")
-        source = ViewSource(scene, CAMERA, np.random.default_rng(number))
-        write_shard(folder / f"{number}.h5", scene, [source.draw() for _ in range(count)], CAMERA, 0)
+        source = ViewSource(scene, CAMERA, TEXTURE, np.random.default_rng(number))
+        write_shard(folder / f"{number}.h5", scene, [source.draw() for _ in range(count)], CAMERA, TEXTURE, 0)
     return folder
 
 
 @pytest.fixture
 def views(folder) -> ViewSet:
-    return ViewSet([Shard(folder / f"{number}.h5", CAMERA) for number in range(2)])
+    return ViewSet([Shard(folder / f"{number}.h5", CAMERA, TEXTURE) for number in range(2)])
+
+
+def stream(name: str, views: ViewSet, bank: TextureBank, seed: int = 1, batch: int = 6) -> TupleStream:
+    if name in ("synth", "paper"):
+        return SynthTuples(views, bank, CAMERA, seed, batch, fresh=name == "synth")
+    kind = {"modsem": ModSemTuples, "depth": DepthProjTuples, "semantic": SemanticTuples}[name]
+    return kind(views, CAMERA, seed, batch)
+
+
+def views_of_samples(views: ViewSet, samples: list[dict]) -> list[View]:
+    """The view that each sample was made of."""
+    view_of = {view.rgb.tobytes(): view for _, view in (views.locate(i) for i in range(len(views)))}
+    assert len(view_of) == len(views)
+    rgb = [np.round(np.moveaxis(sample["rgb"], 0, -1) * 255).astype(np.uint8) for sample in samples]
+    return [view_of[image.tobytes()] for image in rgb]
 
 
 def same(a: dict, b: dict) -> bool:
@@ -53,49 +84,53 @@ def test_view_set_runs_through_its_shards(views):
         assert np.array_equal(view.rgb, views.shards[shard].view(index - 5 * shard).rgb)
 
 
-def test_batch_has_the_documented_form(views, bank):
-    batch = SynthTuples(views, bank, CAMERA, seed=0, batch=6).batch(0)
+@pytest.mark.parametrize("name", STREAMS)
+def test_batch_has_the_documented_form(views, bank, name):
+    batch = stream(name, views, bank).batch(0)
+    modalities = len(LABELS) if name == "semantic" else 1
     shapes = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in batch.items()}
     assert shapes == {
         "rgb": ((6, 3, 24, 24), torch.float32),
-        "zero": ((6, 1, 24, 24), torch.float32),
+        "zero": ((6, modalities, 24, 24), torch.float32),
         "depth": ((6, 1, 24, 24), torch.float32),
-        "target": ((6, 1, 20, 20), torch.float32),
+        "target": ((6, modalities, 20, 20), torch.float32),
         "aux": ((6, 2, 20, 20), torch.float32),
         "fov": ((6, 1, 20, 20), torch.float32),
         "scene": ((6,), torch.int64),
     }
-    for name in ("zero", "target", "aux", "fov"):
-        assert set(batch[name].unique().tolist()) <= {0.0, 1.0}
+    for image in ("zero", "target", "aux", "fov"):
+        assert set(batch[image].unique().tolist()) == {0.0, 1.0}
     assert batch["rgb"].min() >= 0 and 0.5 < batch["rgb"].max() <= 1
 
 
-def test_batch_is_a_function_of_seed_and_step(views, bank):
-    stream = SynthTuples(views, bank, CAMERA, seed=1, batch=4)
-    in_order = [stream.batch(step) for step in range(4)]
-    fresh = SynthTuples(views, bank, CAMERA, seed=1, batch=4)
+@pytest.mark.parametrize("name", STREAMS)
+def test_batch_is_a_function_of_seed_and_step(views, bank, name):
+    first = stream(name, views, bank, batch=4)
+    in_order = [first.batch(step) for step in range(4)]
+    fresh = stream(name, views, bank, batch=4)
     for step in (3, 0, 2, 1):
         assert same(fresh.batch(step), in_order[step])
-    assert not same(in_order[0], in_order[2])  # the same views may come again, their textures never
-    assert not same(SynthTuples(views, bank, CAMERA, seed=2, batch=4).batch(0), in_order[0])
+    assert not same(stream(name, views, bank, seed=2, batch=4).batch(0), in_order[0])
 
 
 @pytest.mark.parametrize("ranks", [2, 3])
-def test_ranks_share_a_batch_without_overlap(views, bank, ranks):
-    stream = SynthTuples(views, bank, CAMERA, seed=1, batch=6)
-    whole, parts = stream.batch(1), [stream.batch(1, rank, ranks) for rank in range(ranks)]
-    for name in whole:
-        together = torch.stack([part[name] for part in parts], dim=1).flatten(0, 1)
-        assert torch.equal(together, whole[name])
+@pytest.mark.parametrize("name", STREAMS)
+def test_ranks_share_a_batch_without_overlap(views, bank, name, ranks):
+    whole = stream(name, views, bank).batch(1)
+    parts = [stream(name, views, bank).batch(1, rank, ranks) for rank in range(ranks)]
+    for tensor in whole:
+        together = torch.stack([part[tensor] for part in parts], dim=1).flatten(0, 1)
+        assert torch.equal(together, whole[tensor])
 
 
-def test_every_epoch_is_a_permutation_of_the_views(views, bank):
-    stream = SynthTuples(views, bank, CAMERA, seed=3, batch=1)
+@pytest.mark.parametrize("name", STREAMS)
+def test_every_epoch_is_a_permutation_of_the_views(views, bank, name):
+    data = stream(name, views, bank, seed=3)
     index_of = {views.locate(i)[1].rgb.tobytes(): i for i in range(len(views))}
     assert len(index_of) == len(views)
     order = []
     for i in range(3 * len(views)):
-        sample = stream.sample(i)
+        sample = data.sample(i)
         rgb = np.round(np.moveaxis(sample["rgb"], 0, -1) * 255).astype(np.uint8)
         order.append(index_of[rgb.tobytes()])
         assert sample["scene"] == (order[-1] >= COUNTS[0])
@@ -104,14 +139,12 @@ def test_every_epoch_is_a_permutation_of_the_views(views, bank):
     assert len({tuple(epoch) for epoch in epochs}) == 3
 
 
-def test_the_same_texel_has_the_same_value_in_image_and_map(views, bank):
+@pytest.mark.parametrize("name", ["synth", "paper", "modsem"])
+def test_the_same_texel_has_the_same_value_in_image_and_map(views, bank, name):
     """P1: one texture on the surfaces, looked up twice."""
-    stream = SynthTuples(views, bank, CAMERA, seed=0, batch=1)
-    index_of = {views.locate(i)[1].depth.tobytes(): i for i in range(len(views))}
+    samples = [stream(name, views, bank).sample(i) for i in range(4 * len(views))]
     shared = 0
-    for i in range(4 * len(views)):
-        sample = stream.sample(i)
-        _, view = views.locate(index_of[sample["depth"][0].tobytes()])
+    for sample, view in zip(samples, views_of_samples(views, samples)):
         texel = np.concatenate([view.fpv_texel.reshape(-1, 3), view.bev_texel.reshape(-1, 3)])
         value = np.concatenate([sample["zero"].ravel(), sample["target"].ravel()])
         unique, inverse = np.unique(texel, axis=0, return_inverse=True)
@@ -124,16 +157,99 @@ def test_the_same_texel_has_the_same_value_in_image_and_map(views, bank):
     assert shared > 10
 
 
+def test_in_the_papers_mode_a_scene_wears_one_texture(views, bank):
+    """Each view looks the same in every epoch and texels the same in every view; other scenes and seeds differ."""
+    bank = TextureBank(bank.tiles, replace(bank.config, scales=(1, 5)))
+
+    def white(seed: int) -> dict[tuple, set]:
+        """Values seen at each (scene, texel) in three epochs."""
+        values: dict[tuple, set] = {}
+        data = stream("paper", views, bank, seed)
+        samples = [data.sample(i) for i in range(3 * len(views))]
+        for sample, view in zip(samples, views_of_samples(views, samples)):
+            for texel, value in zip(view.fpv_texel.reshape(-1, 3).tolist(), sample["zero"].ravel().tolist()):
+                values.setdefault((int(sample["scene"]), *texel), set()).add(value)
+        return values
+
+    first, other = white(0), white(1)
+    assert all(len(values) == 1 for values in first.values())
+    assert 0.1 < np.mean([first[texel] != other[texel] for texel in first]) < 0.9
+    places = [texel[1:] for texel in first if texel[0] == 0 and (1, *texel[1:]) in first]
+    assert 0.1 < np.mean([first[0, *place] != first[1, *place] for place in places]) < 0.9
+    # while a fresh texture differs from one epoch to the next
+    fresh = stream("synth", views, bank)
+    samples = [fresh.sample(i) for i in range(2 * len(views))]
+    zeros = {view.rgb.tobytes(): [] for view in views_of_samples(views, samples)}
+    for sample, view in zip(samples, views_of_samples(views, samples)):
+        zeros[view.rgb.tobytes()].append(sample["zero"])
+    assert all(not np.array_equal(*pair) for pair in zeros.values())
+
+
+def test_modsem_shows_one_of_the_draws_at_random(views, bank):
+    rng = np.random.default_rng(0)
+    fpv, bev = rng.integers(0, 256, (24, 24), np.uint8), rng.integers(0, 256, (20, 20), np.uint8)
+    view = replace(views.locate(0)[1], fpv_modsem=fpv, bev_modsem=bev)
+    draws = [(fpv >> bit & 1, bev >> bit & 1) for bit in range(MODSEM_DRAWS)]
+    shown = np.zeros(MODSEM_DRAWS, int)
+    for _ in range(400):
+        zero, target = stream("modsem", views, bank).pair(view, 0, rng)
+        shown += [np.array_equal(zero[0], image) and np.array_equal(target[0], map_) for image, map_ in draws]
+    assert shown.sum() == 400 and shown.min() > 25
+
+
+def test_modsem_is_white_on_instances_alone(views, bank):
+    data = stream("modsem", views, bank)
+    samples = [data.sample(i) for i in range(5 * len(views))]
+    for sample, view in zip(samples, views_of_samples(views, samples)):
+        assert not sample["zero"][0][view.fpv_instance == 0].any()
+        assert not sample["target"][0][view.bev_instance == 0].any()
+        assert sample["zero"].any() and sample["target"].any()
+
+
+def test_depth_proj_is_the_projection_of_its_rectangles(views, bank):
+    batch = stream("depth", views, bank, batch=20).batch(0)
+    assert torch.equal(batch["target"], project(batch["zero"], batch["depth"], CAMERA))
+    assert (batch["target"] <= batch["fov"]).all()  # nothing is known that was not seen
+    assert len({image.numpy().tobytes() for image in batch["zero"]}) == 20
+
+
+def test_semantic_tuples_are_the_samples_of_the_evaluation(views, bank):
+    batch = stream("semantic", views, bank, batch=len(views)).batch(0)
+    evaluated = next(semantic_batches(views, CAMERA, len(views)))
+    order = [(evaluated["rgb"] == rgb).flatten(1).all(dim=1).nonzero().item() for rgb in batch["rgb"]]
+    assert sorted(order) == list(range(len(views)))
+    assert same(batch, {name: tensor[order] for name, tensor in evaluated.items()})
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_depth_may_be_replaced(views, bank, dtype):
+    rng = np.random.default_rng(0)
+    maps = [rng.uniform(0.5, 6, (count, 24, 24)).astype(dtype) for count in COUNTS]
+    predicted = views.with_depth(maps)
+    for i in range(len(views)):
+        (scene, view), (same_scene, given) = predicted.locate(i), views.locate(i)
+        assert scene == same_scene and view.depth.dtype == np.float32
+        assert np.array_equal(view.depth, maps[scene][i - scene * COUNTS[0]])
+        assert np.array_equal(view.rgb, given.rgb) and not np.array_equal(view.depth, given.depth)
+    batch, given = (stream("depth", each, bank).batch(0) for each in (predicted, views))
+    assert torch.equal(batch["target"], project(batch["zero"], batch["depth"], CAMERA))
+    assert torch.equal(batch["zero"], given["zero"]) and not torch.equal(batch["target"], given["target"])
+    with pytest.raises(InputError, match=r"depth maps: expected \[5, 3\] views a shard, found \[3, 5\]"):
+        views.with_depth(maps[::-1])
+    with pytest.raises(InputError, match=r"depth maps: expected views of \(24, 24\), found \(20, 24\)"):
+        views.with_depth([map_[:, :20] for map_ in maps]).locate(0)
+
+
 def test_textures_are_independent_of_the_scene(folder, bank):
     """P3: over many draws every class of the map, and every cell, is white as often as the texture is."""
-    views = ViewSet([Shard(folder / "0.h5", CAMERA)])
+    views = ViewSet([Shard(folder / "0.h5", CAMERA, TEXTURE)])
     draws = 400
     label = views.shards[0].instance_label
-    stream = SynthTuples(views, bank, CAMERA, seed=0, batch=1)
+    data = stream("synth", views, bank, seed=0)
     index_of = {views.locate(i)[1].depth.tobytes(): i for i in range(len(views))}
     white: dict[int, list[np.ndarray]] = {i: [] for i in range(len(views))}
     for i in range(draws):
-        sample = stream.sample(i)
+        sample = data.sample(i)
         white[index_of[sample["depth"][0].tobytes()]].append(sample["target"][0])
     for i, maps in white.items():
         maps = np.array(maps)
@@ -176,7 +292,7 @@ def test_auxiliary_maps_split_the_surfaces_at_ten_centimetres():
     texel[3] = -1
     image = np.zeros((side, side, 3), np.uint8)
     nothing = np.zeros((side, side))
-    view = View(image, nothing, texel, nothing, texel, nothing, height, nothing > 0, np.zeros(4))
+    view = View(image, nothing, texel, nothing, nothing, texel, nothing, nothing, height, nothing > 0, np.zeros(4))
     sample = view_sample(view, CAMERA, 0, nothing[None], nothing[None])
     obstacles, navigable = sample["aux"]
     assert obstacles.tolist() == [[0, 0, 0, 0], [1, 1, 1, 0], [0] * 4, [0] * 4]

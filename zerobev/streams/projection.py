@@ -3,6 +3,8 @@
 Written in torch, since the residual model uses it inside the network; images come in batches.
 """
 
+from functools import cache
+
 import numpy as np
 import torch
 from scipy.spatial import ConvexHull
@@ -10,13 +12,15 @@ from scipy.spatial import ConvexHull
 from zerobev.config import CameraConfig
 from zerobev.sensors.cameras import fpv_rays
 
+_rays = cache(fpv_rays)
+
 
 def map_points(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
     """Points seen by the pixels of `depth` in the map frame (x right, y forward, z above the floor).
 
     depth: (..., H, W) planar depth, metres. Returns (..., H, W, 3) of the same dtype, metres.
     """
-    rays = torch.as_tensor(fpv_rays(camera), dtype=depth.dtype, device=depth.device)
+    rays = torch.as_tensor(_rays(camera), dtype=depth.dtype, device=depth.device)
     return torch.stack([rays[..., 0] * depth, depth, camera.height_m - rays[..., 1] * depth], dim=-1)
 
 
@@ -42,6 +46,13 @@ def project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> to
     (supplement, "residual variant") marks exactly the cells that some white pixel falls into, whatever the
     height of a voxel; the maximum over pixels is that, and serves values in [0, 1] as well.
 
+    The paper's voxels are 100 x 100 x 100, so a column of them is a cell of its map of 100 x 100. With a smaller map,
+    of 40 x 40 or 20 x 20 cells, columns may be cut finer than cells; it makes no difference where a cell is made of
+    whole columns (20 does: 5 x 5 columns a cell), since a cell then holds a white point if and only if one of its
+    columns does. 40 does not divide 100: a column of 5 cm that straddles the edge of two cells of 12.5 cm would have to
+    be given to one of them, and would move a point by up to 2.5 cm for nothing. Points are therefore put into cells
+    directly, at every size.
+
     zero: (B, K, H, W) values >= 0; depth: (B, 1, H, W) metres. Returns (B, K, M, M), 0 where no pixel falls.
     """
     batch, modalities = zero.shape[:2]
@@ -59,11 +70,15 @@ def fov_mask(depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
     cell in the mask, since the hull is that of the cells' corners.
     """
     side = camera.bev_px
-    reached = np.unique(cells_of_pixels(torch.from_numpy(depth), camera).numpy())
-    row, column = np.divmod(reached[reached < side * side], side)
+    reached = np.zeros(side * side + 1, bool)
+    reached[cells_of_pixels(torch.from_numpy(depth), camera).numpy()] = True
+    reached = reached[:-1].reshape(side, side)
+    row = np.flatnonzero(reached.any(axis=1))
     if not len(row):
         return np.zeros((side, side), bool)
-    corners = np.concatenate([np.stack([column + dx, row + dy], axis=1) for dx in (0, 1) for dy in (0, 1)])
+    # the hull is that of the first and the last cell of each row
+    ends = reached[row].argmax(axis=1), side - reached[row, ::-1].argmax(axis=1)
+    corners = np.concatenate([np.stack([column, row + dy], axis=1) for column in ends for dy in (0, 1)])
     planes = ConvexHull(corners).equations  # (edges, 3): a x + b y + c <= 0 inside
     centre = np.stack(np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5), axis=-1)
     return (centre @ planes[:, :2].T + planes[:, 2] <= 1e-9).all(axis=-1)

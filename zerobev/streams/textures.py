@@ -20,6 +20,8 @@ from zerobev.storage import replacing
 from zerobev.streams.sources import SourceImages
 
 KERNELS = ("ellipse", "square", "cross")
+#: *Mod. Sem.* textures that are made of each scene; a byte has room for eight, but they differ little.
+MODSEM_DRAWS = 4
 #: Sources tried for one texture before they are taken to hold no structure at all.
 MAX_SOURCES = 2000
 
@@ -38,24 +40,40 @@ def kernel_runs(shape: str, size: int) -> np.ndarray:
 def dilate(mask: np.ndarray, runs: np.ndarray, wrap: bool) -> np.ndarray:
     """Binary dilation of `mask` (rows, cols) bool by a kernel given as `kernel_runs`; `wrap`: on the torus.
 
-    The kernel's anchor is its texel `size // 2`. A row of the kernel is a run, and the union over a run
-    takes the logarithm of its length: some fifty times faster than a library's general kernels at 30 px.
+    The kernel's anchor is its texel `size // 2`. Rows are packed into words of 64 texels; a row of the kernel
+    is a run, and the union over a run takes the logarithm of its length.
     """
     rows, columns = mask.shape
     size = len(runs)
     before, after = (size - 1) // 2, size // 2
-    line = np.pad(mask, ((before, after), (before, after)), mode="wrap" if wrap else "constant")
-    dilated = np.zeros_like(mask)
+    padded = np.pad(mask, ((before, after), (before, after)), mode="wrap" if wrap else "constant")
+    words = -(-padded.shape[1] // 64)
+    line = np.zeros((len(padded), 8 * words), np.uint8)
+    packed = np.packbits(padded, axis=1, bitorder="little")
+    line[:, : packed.shape[1]] = packed
+    line = line.reshape(-1).view("<u8")
+    dilated = np.zeros(rows * words, "<u8")
     length = 1
-    for run in np.unique(runs):
-        while length < run:  # line[:, x] is the union of `length` texels from x on
+    for run in np.unique(runs).tolist():
+        while length < run:  # bit x of a row is the union of `length` texels from x on
             step = min(length, run - length)
-            line = line[:, :-step] | line[:, step:]
+            line = line | _ahead(line, step)
             length += step
-        left = (size - run + 1) // 2  # a kernel reaches one way, its texels look the other way
-        for top in size - 1 - np.flatnonzero(runs == run):
-            dilated |= line[top : top + rows, left : left + columns]
-    return dilated
+        line_from_left = _ahead(line, (size - run + 1) // 2)  # a kernel reaches one way, its texels look the other way
+        for top in (size - 1 - np.flatnonzero(runs == run)).tolist():
+            dilated |= line_from_left[top * words : (top + rows) * words]
+    texels = dilated.view(np.uint8).reshape(rows, -1)
+    return np.unpackbits(texels, axis=1, count=columns, bitorder="little").view(bool)
+
+
+def _ahead(bits: np.ndarray, by: int) -> np.ndarray:
+    """`bits` (n,) uint64 as one string, first bit lowest, without its first `by` bits; zeros follow at its end."""
+    words, rest = divmod(by, 64)
+    moved = np.zeros_like(bits)
+    np.right_shift(bits[words:], rest, out=moved[: len(bits) - words])
+    if rest:
+        moved[: len(bits) - words - 1] |= bits[words + 1 :] << (64 - rest)
+    return moved
 
 
 def opening(mask: np.ndarray, runs: np.ndarray) -> np.ndarray:
@@ -146,15 +164,15 @@ def _dilated_until(
         if np.count_nonzero(dilated) <= white:
             mask = dilated
             continue
-        fits, exceeds = 1, size
-        below, above = mask, dilated
-        while exceeds - fits > 1:
-            middle = (fits + exceeds) // 2
+        sizes, results = [1, int(size)], [mask, dilated]
+        while sizes[1] - sizes[0] > 1:
+            few, many = map(np.count_nonzero, results)
+            guess = int(np.interp(white, (few, many), sizes))  # the white grows almost evenly with the size
+            middle = min(max(guess, sizes[0] + 1), sizes[1] - 1)
             dilated = dilate(mask, kernel_runs(shape, middle), wrap)
-            if np.count_nonzero(dilated) <= white:
-                fits, below = middle, dilated
-            else:
-                exceeds, above = middle, dilated
+            exceeds = int(np.count_nonzero(dilated) > white)
+            sizes[exceeds], results[exceeds] = middle, dilated
+        below, above = results
         ring = np.flatnonzero(above & ~below)
         start = np.searchsorted(ring, rng.integers(mask.size))
         mask = below.copy()
@@ -162,25 +180,39 @@ def _dilated_until(
     return mask
 
 
-def modsem_texture(instance_image: np.ndarray, config: TextureConfig, rng: np.random.Generator) -> np.ndarray:
-    """The *Mod. Sem.* texture of a chart: (rows, cols) bool (paper, supplement, "Mod. Sem.").
+def modsem_textures(
+    instance_image: np.ndarray, config: TextureConfig, rng: np.random.Generator, draws: int = MODSEM_DRAWS
+) -> np.ndarray:
+    """Independent *Mod. Sem.* textures of a chart: (draws, rows, cols) bool (paper, supplement, "Mod. Sem.").
 
-    `instance_image` (rows, cols) uint16 holds instance ids. All texels of an instance are white, then eroded
-    by random kernels until `config.share` of the chart is left (all, if there was less). Beyond the chart is
-    black: a chart that is covered edge to edge erodes from its edges.
+    `instance_image` (rows, cols) uint16 holds instance ids, 0 for none. All texels of instances are white, then
+    eroded by random kernels until `config.modsem_share` of them is left. Two readings of the paper are taken:
+    - The share is of the texels that an instance covers, not of the chart: as much of the surfaces is white as
+      with a *Synth* texture of this share, however much of the atlas is unused.
+    - Instances erode one by one: a line one texel wide is black where two of them touch, and so is all beyond the
+      chart. Without it, a densely packed chart is one white sheet, which shows nothing of the objects on it.
+    Kernels are in texels: where an atlas has uneven density (as scans have), coarse parts lose wider margins in metres.
+    Draws differ by the margins alone, and are alike where the share leaves little choice.
     """
-    ground = np.pad(instance_image == 0, 1, constant_values=True)
-    black = ground.size - round(config.share * instance_image.size)
-    return ~_dilated_until(ground, black, config.kernel_px, rng, wrap=False)[1:-1, 1:-1]
+    covered = instance_image > 0
+    white = covered.copy()
+    for here, there in (np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:]):
+        white[here] &= (instance_image[here] == instance_image[there]) | ~covered[there]
+    ground = ~np.pad(white, 1)
+    black = ground.size - round(config.modsem_share * np.count_nonzero(covered))
+    eroded = [_dilated_until(ground, black, config.kernel_px, rng, wrap=False) for _ in range(draws)]
+    return ~np.array(eroded)[:, 1:-1, 1:-1]
 
 
 def random_rectangles(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """The FPV image of *Depth proj.*: (rows, cols) bool, 10 to 20 white rectangles on black (paper, supplement)."""
+    count = rng.integers(10, 21)
+    largest = np.maximum(np.array(shape) // 3, 1)
+    sides = rng.integers(1, largest + 1, size=(count, 2))
+    corners = rng.integers(np.array(shape) - sides + 1)
     image = np.zeros(shape, bool)
-    for _ in range(rng.integers(10, 21)):
-        height, width = (rng.integers(1, max(2, side // 3 + 1)) for side in shape)
-        row, column = (rng.integers(side - length + 1) for side, length in zip(shape, (height, width)))
-        image[row : row + height, column : column + width] = True
+    for (top, left), (bottom, right) in zip(corners.tolist(), (corners + sides).tolist()):
+        image[top:bottom, left:right] = True
     return image
 
 
@@ -226,20 +258,25 @@ class TextureBank:
                 config = json.loads(str(file["config"]))
         except Exception as error:
             raise InputError(f"{path}: expected a texture bank, found {error}") from error
-        config["kernel_px"] = tuple(config["kernel_px"])
-        return cls(tiles, TextureConfig(**config))
+        pairs = {name: tuple(value) for name, value in config.items() if isinstance(value, list)}
+        return cls(tiles, TextureConfig(**config | pairs))
 
-    def draw(self, rng: np.random.Generator, charts: int, scale: float = 1.0) -> TextureDraw:
-        """Draw a texture for each of `charts` charts, independent of all that is on them."""
-        if scale < 1:
-            raise InputError(f"texel scale: expected at least 1, found {scale}")
+    def draw(self, rng: np.random.Generator, charts: int) -> TextureDraw:
+        """Draw a texture for each of `charts` charts, independent of all that is on them, and one scale for all.
+
+        The scale is log-uniform between `config.scales`: the paper gives kernels in texels, and not what a texel
+        measures.
+        """
+        low, high = self.config.scales
+        if not 1 <= low <= high:
+            raise InputError(f"texture scales: expected 1 <= low <= high, found {low} and {high}")
         count, side, _ = self.tiles.shape
         return TextureDraw(
             tile=rng.integers(count, size=charts),
             offset=rng.integers(side, size=(charts, 2), dtype=np.int32),
             transpose=rng.random(charts) < 0.5,
             flip=rng.random((charts, 2)) < 0.5,
-            scale=scale,
+            scale=low * (high / low) ** rng.random(),
         )
 
     def look_up(self, texels: np.ndarray, draw: TextureDraw) -> np.ndarray:
@@ -258,7 +295,10 @@ class TextureBank:
         chart = texels[..., 0].astype(np.intp)
         index = first[chart]
         for axis in (0, 1):
-            place = (texels[..., 1 + axis] * draw.scale).astype(np.int32) + draw.offset[:, axis][chart]
+            place = texels[..., 1 + axis].astype(np.int32)
+            if draw.scale != 1:
+                place = (place * draw.scale).astype(np.int32)
+            place += draw.offset[:, axis][chart]
             place -= place // side * side  # numpy's % is slower
             index += place * stride[:, axis][chart]
         return self.tiles.reshape(-1)[index] & (chart >= 0)

@@ -1,21 +1,27 @@
 """Views -> tuples (I_rgb, I_zero, M_zero, M_aux): the streams that networks are trained and tested on.
 
-Batches are dicts of float32 tensors (B samples, K modalities, H pixels and M cells a side):
+Batches are dicts of tensors, float32 but for `scene` (B samples, K modalities, H pixels and M cells a side):
 `rgb` (B, 3, H, H) in [0, 1]; `zero` (B, K, H, H) and `target` (B, K, M, M) in {0, 1}; `aux` (B, 2, M, M)
 obstacles and navigable space; `fov` (B, 1, M, M) mask; `depth` (B, 1, H, H) metres; and `scene` (B,) int64.
 """
 
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from zerobev.config import LABELS, CameraConfig
+from zerobev.errors import InputError
+from zerobev.streams.projection import project
 from zerobev.streams.shards import Shard
-from zerobev.streams.textures import TextureBank
+from zerobev.streams.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.streams.views import View
 
 Sample = dict[str, np.ndarray]
+#: The images of K modalities in FPV (K, H, H) and the same on the map (K, M, M), bool or float.
+Pair = tuple[np.ndarray, np.ndarray]
 
 
 class ViewSet:
@@ -24,30 +30,55 @@ class ViewSet:
     def __init__(self, shards: list[Shard]) -> None:
         self.shards = shards
         self._start = np.cumsum([0, *(len(shard) for shard in shards)])
+        self._depth: Sequence[np.ndarray] | None = None
 
     def __len__(self) -> int:
         return int(self._start[-1])
 
+    def with_depth(self, maps: Sequence[np.ndarray]) -> "ViewSet":
+        """The same views with their depth replaced, by a predicted one say.
+
+        maps: for each shard one array-like (V, H, H) of planar depth in metres, float16 or float32, which is read view
+        by view (it may lie in a file). Arrays that do not fit the shards are an `InputError`.
+        """
+        expected = [len(shard) for shard in self.shards]
+        found = [len(shard_maps) for shard_maps in maps]
+        if found != expected:
+            raise InputError(f"depth maps: expected {expected} views a shard, found {found}")
+        changed = ViewSet(self.shards)
+        changed._depth = maps
+        return changed
+
     def locate(self, index: int) -> tuple[int, View]:
         """Number of the shard that holds view `index`, and the view."""
         shard = int(np.searchsorted(self._start, index, side="right")) - 1
-        return shard, self.shards[shard].view(index - int(self._start[shard]))
+        place = index - int(self._start[shard])
+        view = self.shards[shard].view(place)
+        if self._depth is None:
+            return shard, view
+        depth = np.asarray(self._depth[shard][place], np.float32)
+        if depth.shape != view.depth.shape:
+            raise InputError(f"depth maps: expected views of {view.depth.shape}, found {depth.shape}")
+        return shard, replace(view, depth=depth)
 
 
-class SynthTuples:
-    """Endless training tuples with a fresh *Synth* texture for every sample (paper, Section 3.2).
+class TupleStream(ABC):
+    """Endless training tuples, whatever their modality.
 
     Sample i is a function of (seed, i) alone: training may stop at any step and go on, or be spread over
     processes, and sees the same data. Each pass over the views is in a new random order.
     """
 
-    def __init__(self, views: ViewSet, bank: TextureBank, camera: CameraConfig, seed: int, batch: int) -> None:
+    def __init__(self, views: ViewSet, camera: CameraConfig, seed: int, batch: int) -> None:
         self._views = views
-        self._bank = bank
         self._camera = camera
         self._seed = seed
         self._batch = batch
         self._epoch = -1
+
+    @abstractmethod
+    def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
+        """The modality of `view`, a view of scene number `scene`; `rng` is that of the sample."""
 
     def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, torch.Tensor]:
         """The batch of a training step; with several ranks each gets every `ranks`-th sample of it."""
@@ -57,12 +88,9 @@ class SynthTuples:
     def sample(self, index: int) -> Sample:
         """Tuple number `index`."""
         epoch, position = divmod(index, len(self._views))
-        shard, view = self._views.locate(int(self._order(epoch)[position]))
-        draw = self._bank.draw(np.random.default_rng([self._seed, 1, index]), self._views.shards[shard].charts)
-        zero = self._bank.look_up(view.fpv_texel, draw)
-        target = self._bank.look_up(view.bev_texel, draw)
-        return view_sample(view, self._camera, shard, zero[None], target[None])
-
+        scene, view = self._views.locate(int(self._order(epoch)[position]))
+        zero, target = self.pair(view, scene, np.random.default_rng([self._seed, 1, index]))
+        return view_sample(view, self._camera, scene, zero, target)
 
     def _order(self, epoch: int) -> np.ndarray:
         """The order of the views in a pass over them; kept until another pass is asked for."""
@@ -70,6 +98,56 @@ class SynthTuples:
             self._epoch = epoch
             self._permutation = np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))
         return self._permutation
+
+
+class SynthTuples(TupleStream):
+    """*Synth* textures (paper, Section 3.2): a fresh one for every sample, or one a scene as in the paper.
+
+    With `fresh=False` the texture of a scene, its scale included, is a function of (seed, scene), the same in all
+    epochs. Scales are drawn between `bank.config.scales`.
+    """
+
+    def __init__(
+        self, views: ViewSet, bank: TextureBank, camera: CameraConfig, seed: int, batch: int, fresh: bool = True
+    ) -> None:
+        super().__init__(views, camera, seed, batch)
+        self._bank = bank
+        self._fresh = fresh
+
+    def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
+        """The texture on the surfaces as both sensors see it."""
+        shard = self._views.shards[scene]
+        if not self._fresh:
+            rng = np.random.default_rng([self._seed, 2, scene])
+        draw = self._bank.draw(rng, shard.charts)
+        return self._bank.look_up(view.fpv_texel, draw)[None], self._bank.look_up(view.bev_texel, draw)[None]
+
+
+class ModSemTuples(TupleStream):
+    """*Mod. Sem.* textures (paper, Table 5 and supplement): eroded objects; a sample shows one of a scene's draws."""
+
+    def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
+        """One bit of the draws that were recorded with the view."""
+        bit = np.uint8(1 << rng.integers(MODSEM_DRAWS))
+        return view.fpv_modsem[None] & bit > 0, view.bev_modsem[None] & bit > 0
+
+
+class DepthProjTuples(TupleStream):
+    """*Depth proj.* (paper, Table 5 and supplement): random rectangles, projected with the depth of the view."""
+
+    def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
+        """Rectangles in the image, and the cells that a white pixel falls into."""
+        zero = random_rectangles(view.depth.shape, rng)[None]
+        image, depth = torch.from_numpy(zero)[None].float(), torch.from_numpy(view.depth)[None, None]
+        return zero, project(image, depth, self._camera)[0].numpy()
+
+
+class SemanticTuples(TupleStream):
+    """The eight classes as modalities (K = 8, in the order of `LABELS`): what TIM and VPN are trained on."""
+
+    def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
+        """The masks of the classes; nothing is random."""
+        return class_masks(view, self._views.shards[scene].instance_label)
 
 
 def semantic_batches(views: ViewSet, camera: CameraConfig, batch: int) -> Iterator[dict[str, torch.Tensor]]:
@@ -80,10 +158,14 @@ def semantic_batches(views: ViewSet, camera: CameraConfig, batch: int) -> Iterat
 
 def semantic_sample(views: ViewSet, index: int, camera: CameraConfig) -> Sample:
     """View number `index` with the masks of the eight classes in FPV and in BEV."""
-    shard, view = views.locate(index)
-    label = views.shards[shard].instance_label
-    classes = np.arange(len(LABELS))[:, None, None]
-    return view_sample(view, camera, shard, label[view.fpv_instance] == classes, label[view.bev_instance] == classes)
+    scene, view = views.locate(index)
+    return view_sample(view, camera, scene, *class_masks(view, views.shards[scene].instance_label))
+
+
+def class_masks(view: View, instance_label: np.ndarray) -> Pair:
+    """The masks of the eight classes; `instance_label` (largest id + 1,) int8 is the label of each instance id."""
+    classes = np.arange(len(LABELS), dtype=np.int8)[:, None, None]
+    return instance_label[view.fpv_instance] == classes, instance_label[view.bev_instance] == classes
 
 
 def view_sample(view: View, camera: CameraConfig, scene: int, zero: np.ndarray, target: np.ndarray) -> Sample:

@@ -1,10 +1,10 @@
 """A view: everything the sensors record at one pose, and the drawing of poses worth recording."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from zerobev.config import AgentConfig, CameraConfig
+from zerobev.config import AgentConfig, CameraConfig, TextureConfig
 from zerobev.errors import InputError
 from zerobev.scenes.scene import Scene
 from zerobev.sensors.cameras import Pose
@@ -12,7 +12,9 @@ from zerobev.sensors.gbuffer import RayCaster
 from zerobev.sensors.photograph import Photographer
 from zerobev.sensors.poses import navigable_floor
 from zerobev.streams.projection import fov_mask
+from zerobev.streams.textures import MODSEM_DRAWS, modsem_textures
 
+_GLANCE_PX = 64  # a larger image is cast only where one of this size sees enough of the map
 _TRIES = 50  # poses drawn for one view before the scene is given up
 
 
@@ -24,18 +26,25 @@ class View:
     depth: np.ndarray  #: (H, H) float32 planar depth, metres, 0 for nothing
     fpv_texel: np.ndarray  #: (H, H, 3) int16 chart, row, column; chart -1 for nothing
     fpv_instance: np.ndarray  #: (H, H) uint16
+    fpv_modsem: np.ndarray  #: (H, H) uint8: bit b is white in draw b of the scene's *Mod. Sem.* textures
     bev_texel: np.ndarray  #: (M, M, 3) int16
     bev_instance: np.ndarray  #: (M, M) uint16
+    bev_modsem: np.ndarray  #: (M, M) uint8
     bev_height: np.ndarray  #: (M, M) float32, metres above the floor
     fov: np.ndarray  #: (M, M) bool: cells inside the field of view
     pose: np.ndarray  #: (4,) float64: x, y, height of the floor (metres, world), yaw (radians)
 
 
 class ViewSource:
-    """Draws views of one scene."""
+    """Draws views of one scene. Poses do not depend on `texture`, which is that of the *Mod. Sem.* draws."""
 
     def __init__(
-        self, scene: Scene, camera: CameraConfig, rng: np.random.Generator, agent: AgentConfig | None = None
+        self,
+        scene: Scene,
+        camera: CameraConfig,
+        texture: TextureConfig,
+        rng: np.random.Generator,
+        agent: AgentConfig | None = None,
     ) -> None:
         self._agent = agent or AgentConfig()
         self._camera = camera
@@ -44,6 +53,11 @@ class ViewSource:
         self.floor = navigable_floor(scene, self._agent, rng)
         self._caster = RayCaster(scene)
         self._photographer = Photographer(scene, camera)
+        drawn = rng.spawn(1)[0]
+        draws = (modsem_textures(chart, texture, drawn) for chart in scene.chart_instance)
+        bit = (1 << np.arange(MODSEM_DRAWS)).astype(np.uint8)
+        bits = (np.einsum("drc,d->rc", white.view(np.uint8), bit).ravel() for white in draws)
+        self._modsem = np.concatenate([*bits, [np.uint8(0)]])  # what comes last is nothing
 
     def draw(self) -> View:
         """The view at a fresh pose; poses that face a wall are refused.
@@ -62,6 +76,8 @@ class ViewSource:
 
     def at(self, pose: Pose) -> View | None:
         """The view at `pose`, or None where it sees too little of the map."""
+        if self._camera.fpv_px > _GLANCE_PX and self._is_blocked(replace(self._camera, fpv_px=_GLANCE_PX), pose):
+            return None
         fpv = self._caster.fpv(pose, self._camera)
         fov = fov_mask(fpv.distance, self._camera)
         if fov.mean() < self._agent.least_view:
@@ -72,9 +88,14 @@ class ViewSource:
             depth=fpv.distance,
             fpv_texel=fpv.texel,
             fpv_instance=fpv.instance,
+            fpv_modsem=self._modsem.take(fpv.atlas),
             bev_texel=bev.texel,
             bev_instance=bev.instance,
+            bev_modsem=self._modsem.take(bev.atlas),
             bev_height=bev.distance,
             fov=fov,
             pose=np.array([pose.x, pose.y, pose.floor_z, pose.yaw]),
         )
+
+    def _is_blocked(self, camera: CameraConfig, pose: Pose) -> bool:
+        return fov_mask(self._caster.fpv(pose, camera).distance, camera).mean() < self._agent.least_view
