@@ -1,26 +1,35 @@
 """Scenes -> shards: `python -m zerobev.streams.generate --scenes DIR --out DIR --views N --scale S`.
 
-One shard a scene, in parallel over scenes. A shard depends on the scene, the camera, the number of views
-and the seed alone, so any number of workers writes the same bytes; a run that was killed goes on where it
-was, since a shard that is there is whole.
+One shard a scene, in parallel over scenes (`--workers`, or the workers of a dask cluster with `--dask`). A
+shard depends on the scene, the configuration, the number of views and the seed alone, so any number of
+workers writes the same bytes; a run that was killed goes on where it was, since a shard that is there is
+whole. `--verify` holds what is there against the manifest.
 """
 
 import argparse
+import contextlib
+import gc
+import json
 import sys
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import joblib
 import numpy as np
 
 from zerobev import config
-from zerobev.config import CameraConfig
+from zerobev.config import CameraConfig, TextureConfig
 from zerobev.errors import InputError, run_command
 from zerobev.progress import progress
 from zerobev.scenes.hm3dsem import read_scene, split_scenes
 from zerobev.storage import write_json
-from zerobev.streams.shards import Shard, checksum, write_shard
+from zerobev.streams.shards import Shard, checksum, recorded_with, write_shard
 from zerobev.streams.views import ViewSource
+
+_PARTS = ("train", "validation", "test")
+_MANIFEST = "manifest.json"
 
 
 def shard_path(scene_folder: Path, out: Path) -> Path:
@@ -28,75 +37,202 @@ def shard_path(scene_folder: Path, out: Path) -> Path:
     return out / f"{scene_folder.name}.h5"
 
 
-def generate_shard(scene_folder: Path, out: Path, views: int, camera: CameraConfig, seed: int) -> Path:
+def generate_shard(
+    scene_folder: Path, out: Path, views: int, camera: CameraConfig, texture: TextureConfig, seed: int
+) -> Path:
     """Record `views` views of one scene, unless its shard is there; returns the shard's path.
 
     Raises `InputError` for a broken scene, and for a shard that is damaged or belongs to another run.
     """
     path = shard_path(scene_folder, out)
     if path.exists():
-        found = Shard(path, camera)
-        if (len(found), found.seed) != (views, seed):
-            expected = f"{views} views with seed {seed}"
-            raise InputError(f"{path}: expected {expected}, found {len(found)} with seed {found.seed}")
+        _check_run(path, views, camera, texture, seed)
         return path
     if views < 1:
         raise InputError(f"views: expected 1 or more, found {views}")
+    for unfinished in out.glob(f".{path.stem}.*.part.h5"):  # of a run that was killed
+        unfinished.unlink(missing_ok=True)
     scene = read_scene(scene_folder)
-    # the scene's name is part of the seed, so that its views do not depend on which others there are
-    rng = np.random.default_rng([seed, zlib.crc32(scene_folder.name.encode())])
-    source = ViewSource(scene, camera, rng)
-    write_shard(path, scene, (source.draw() for _ in range(views)), camera, seed)
+    rng = np.random.default_rng(_scene_seed(scene_folder, seed))
+    source = ViewSource(scene, camera, texture, rng)
+    write_shard(path, scene, (source.draw() for _ in range(views)), camera, texture, seed)
     return path
 
 
 def generate(
-    scene_folders: list[Path], out: Path, views: int, camera: CameraConfig, seed: int, workers: int = 1
+    scene_folders: list[Path],
+    out: Path,
+    views: int,
+    camera: CameraConfig,
+    texture: TextureConfig,
+    seed: int,
+    workers: int = 1,
 ) -> dict[str, str]:
-    """Record every scene into `out` and write `manifest.json` there (shard -> SHA-256, seed, number of views).
+    """Record every scene into `out` and write `manifest.json` there: configuration, seeds, SHA-256 of each shard.
 
-    A broken scene is skipped, and a shard of another run is left alone. Returns what was wrong, scene name ->
-    message; empty when all went well.
+    `workers` is a number of processes; under `joblib.parallel_config` with another back end, that one decides. A
+    broken scene is skipped; a shard of another run, or one that is not what the manifest lists, is left alone.
+    Returns what was wrong, scene name -> message; empty when all went well. Raises `InputError` where `out` has a
+    manifest of another run.
     """
-    missing = [folder for folder in scene_folders if not shard_path(folder, out).exists()]
-    jobs = (joblib.delayed(_attempt)(folder, out, views, camera, seed) for folder in missing)
-    outcomes = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
-    shown = progress(outcomes, f"views of {out.name}", "scene", len(missing))
-    recorded = (_attempt(folder, out, views, camera, seed) for folder in scene_folders if folder not in missing)
-    broken = dict(outcome for outcome in (*shown, *recorded) if outcome)
-    shards = sorted(shard_path(folder, out) for folder in scene_folders if folder.name not in broken)
-    manifest = {"seed": seed, "views": views, "shards": {path.name: checksum(path) for path in shards}}
-    write_json(out / "manifest.json", manifest)
-    return broken
+    run = {**recorded_with(camera, texture), "seed": seed, "views": views}
+    listed = _listed(out, run)
+    there = [folder for folder in scene_folders if shard_path(folder, out).exists()]
+    missing = [folder for folder in scene_folders if folder not in there]
+    found: dict[Path, str | InputError] = {}
+    for folders, sums, what in (there, listed, "shards that are there"), (missing, {}, f"views of {out.name}"):
+        jobs = (
+            joblib.delayed(_attempt)(
+                folder, out, views, camera, texture, seed, sums.get(shard_path(folder, out).name, {}).get("sha256")
+            )
+            for folder in folders
+        )
+        outcomes = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
+        found |= zip(folders, list(progress(outcomes, what, "scene", len(folders))))  # to its end: joblib counts on it
+    recorded = {
+        shard_path(folder, out).name: {"seed": _scene_seed(folder, seed), "sha256": outcome}
+        for folder, outcome in found.items()
+        if isinstance(outcome, str)
+    }
+    write_json(out / _MANIFEST, {**run, "shards": listed | recorded})
+    return {folder.name: str(outcome) for folder, outcome in found.items() if isinstance(outcome, InputError)}
 
 
-def _attempt(folder: Path, out: Path, views: int, camera: CameraConfig, seed: int) -> tuple[str, str] | None:
+def _attempt(
+    folder: Path,
+    out: Path,
+    views: int,
+    camera: CameraConfig,
+    texture: TextureConfig,
+    seed: int,
+    listed: str | None,
+) -> str | InputError:
+    """SHA-256 of the scene's shard (`listed`, if that is given), recorded now if need be, or what is wrong with it."""
     try:
-        generate_shard(folder, out, views, camera, seed)
+        path = generate_shard(folder, out, views, camera, texture, seed)
+        if listed:
+            _check_sum(path, listed)
+        return checksum(path)
     except InputError as error:
-        return folder.name, str(error)
-    return None
+        return error
+    finally:
+        # scenes hold themselves in cycles: without this they pile up until the worker's memory is called a leak
+        gc.collect()
+
+
+def _scene_seed(scene_folder: Path, seed: int) -> list[int]:
+    """Seed of a scene's views: its name is part of it, so that they do not depend on which other scenes there are."""
+    return [seed, zlib.crc32(scene_folder.name.encode())]
+
+
+def _listed(out: Path, run: dict[str, Any]) -> dict[str, Any]:
+    """What the manifest in `out` says of each shard, if there is a manifest: it has to be that of `run`."""
+    path = out / _MANIFEST
+    if not path.exists():
+        return {}
+    manifest = _read_manifest(out)
+    shards = manifest.pop("shards")
+    if manifest != run:
+        raise InputError(f"{path}: expected a manifest of {run}, found one of {manifest}")
+    return shards
+
+
+def verify(out: Path) -> list[str]:
+    """Hold the shards in `out` against its manifest; returns a message for each that is missing, damaged or foreign.
+
+    Raises `InputError` for a manifest that is missing or not one.
+    """
+    manifest = _read_manifest(out)
+    camera = CameraConfig(**manifest["camera"])
+    texture = TextureConfig(modsem_share=manifest["modsem_share"])
+    listed = manifest["shards"]
+    names = sorted({path.name for path in out.glob("[!.]*.h5")} | set(listed))
+    problems = []
+    for name in progress(names, f"shards of {out.name}", "shard", len(names)):
+        path = out / name
+        try:
+            if name not in listed:
+                raise InputError(f"{path}: expected a shard that the manifest lists, found one that it does not")
+            if not path.exists():
+                raise InputError(f"{path}: expected a shard, found nothing")
+            _check_sum(path, listed[name]["sha256"])
+            _check_run(path, manifest["views"], camera, texture, manifest["seed"])
+        except InputError as error:
+            problems.append(str(error))
+    return problems
+
+
+def _check_sum(path: Path, expected: str) -> None:
+    if (found := checksum(path)) != expected:
+        raise InputError(f"{path}: expected SHA-256 {expected}, found {found}")
+
+
+def _check_run(path: Path, views: int, camera: CameraConfig, texture: TextureConfig, seed: int) -> None:
+    found = Shard(path, camera, texture)
+    if (len(found), found.seed) != (views, seed):
+        raise InputError(f"{path}: expected {views} views with seed {seed}, found {len(found)} with seed {found.seed}")
+
+
+def _read_manifest(out: Path) -> dict[str, Any]:
+    path = out / _MANIFEST
+    try:
+        manifest = json.loads(path.read_text())
+        CameraConfig(**manifest["camera"])
+        if not all(isinstance(entry["sha256"], str) for entry in manifest["shards"].values()):
+            raise TypeError("a shard without SHA-256")
+        return {key: manifest[key] for key in ("camera", "modsem_share", "seed", "views", "shards")}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        found = "nothing" if isinstance(error, FileNotFoundError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}: expected a manifest of shards, found {found}") from None
 
 
 def main() -> None:
-    """Parse the command line and generate the shards of every split below `--out`."""
+    """Parse the command line; record, or verify, the shards of every split below `--out`."""
     parser = argparse.ArgumentParser(prog="python -m zerobev.streams.generate", description=__doc__)
-    parser.add_argument("--scenes", type=Path, required=True, help="folder in HM3DSem layout")
     parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
+    parser.add_argument("--scenes", type=Path, help="folder in HM3DSem layout")
     parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(config.SCALES)}")
     parser.add_argument("--views", type=int, help="per scene; default: the scale's")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=1)
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=int, default=1, help="processes on this machine")
+    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster that sees both folders")
+    parser.add_argument("--verify", action="store_true", help="check the shards in --out instead")
     options = parser.parse_args()
+    if options.verify:
+        problems = [problem for part in _PARTS for problem in verify(options.out / part)]
+        if problems:
+            sys.exit("\n".join(problems))
+        return
+    if options.scenes is None:
+        parser.error("--scenes is required, except with --verify")
     scale = config.scale(options.scale)
     views = scale.scenes.views if options.views is None else options.views
     split = split_scenes(options.scenes)
     broken: dict[str, str] = {}
-    for name in ("train", "validation", "test"):
-        folders = list(getattr(split, name))
-        broken |= generate(folders, options.out / name, views, scale.camera, options.seed, options.workers)
+    with _cluster(options.dask):
+        for part in _PARTS:
+            folders = list(getattr(split, part))
+            out = options.out / part
+            broken |= generate(folders, out, views, scale.camera, scale.texture, options.seed, options.workers)
     if broken:
         sys.exit("\n".join(f"skipped {name}: {message}" for name, message in broken.items()))
+
+
+@contextlib.contextmanager
+def _cluster(address: str | None) -> Iterator[None]:
+    """Let joblib work on the dask cluster at `address`, if there is one."""
+    if address is None:
+        yield
+        return
+    from dask.distributed import Client  # not needed, and slow to import, without a cluster
+
+    try:
+        client = Client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise InputError(f"--dask: expected the address of a scheduler, found {address!r}: {error}") from None
+    with client, joblib.parallel_config(backend="dask"):
+        yield
 
 
 if __name__ == "__main__":

@@ -5,11 +5,12 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
-from zerobev.config import CameraConfig
+from zerobev.config import CameraConfig, TextureConfig
 from zerobev.errors import InputError
 from zerobev.scenes.scene import Scene
 from zerobev.storage import replacing
@@ -18,31 +19,44 @@ from zerobev.streams.views import View
 _FIELDS = tuple(field.name for field in fields(View))
 
 
-def write_shard(path: Path, scene: Scene, views: Iterable[View], camera: CameraConfig, seed: int) -> None:
-    """Write `views` of `scene` to `path`; nothing is left behind when a view fails."""
-    rows = [tuple(getattr(view, name) for name in _FIELDS) for view in views]
-    record = np.dtype([(name, value.dtype, value.shape) for name, value in zip(_FIELDS, rows[0])])
+def recorded_with(camera: CameraConfig, texture: TextureConfig) -> dict[str, Any]:
+    """What views depend on beside their scene, as plain data: the camera, and the share of *Mod. Sem.* textures."""
+    return {"camera": asdict(camera), "modsem_share": texture.modsem_share}
+
+
+def write_shard(
+    path: Path, scene: Scene, views: Iterable[View], camera: CameraConfig, texture: TextureConfig, seed: int
+) -> None:
+    """Write `views` (one at least) of `scene` to `path`, each as it comes; nothing is left behind when one fails."""
     with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
-        # one record and one chunk a view: a training sample reads one view at random, in one call
-        file.create_dataset("views", data=np.array(rows, record), chunks=(1,), compression="lzf")
+        for index, view in enumerate(views):
+            values = tuple(getattr(view, name) for name in _FIELDS)
+            if index == 0:
+                record = np.dtype([(name, value.dtype, value.shape) for name, value in zip(_FIELDS, values)])
+                # One record and one chunk a view: a training sample reads one view at random, in one call.
+                # Not lzf: what it writes for the same views differs from time to time.
+                storage = {"maxshape": (None,), "chunks": (1,), "compression": "gzip", "compression_opts": 1}
+                table = file.create_dataset("views", (0,), record, **storage)
+            table.resize(index + 1, axis=0)
+            table[index] = np.array(values, record)
         file["instance_label"] = scene.instance_label
         file.attrs["scene"] = scene.name
         file.attrs["charts"] = len(scene.chart_instance)
-        file.attrs["camera"] = json.dumps(asdict(camera))
+        file.attrs["recorded_with"] = json.dumps(recorded_with(camera, texture))
         file.attrs["seed"] = seed
 
 
 class Shard:
     """Reads a shard. The file is opened on first use, so that a `Shard` may travel to a worker process.
 
-    Raises `InputError` for a file that is missing, damaged, or recorded with another camera.
+    Raises `InputError` for a file that is missing, damaged, or recorded with another camera or *Mod. Sem.* share.
     """
 
-    def __init__(self, path: Path, camera: CameraConfig) -> None:
+    def __init__(self, path: Path, camera: CameraConfig, texture: TextureConfig) -> None:
         self.path = Path(path)
         try:
             with h5py.File(self.path) as file:
-                recorded = json.loads(file.attrs["camera"])
+                found = json.loads(file.attrs["recorded_with"])
                 self.scene = str(file.attrs["scene"])
                 self.charts = int(file.attrs["charts"])
                 self.seed = int(file.attrs["seed"])
@@ -50,8 +64,9 @@ class Shard:
                 self._length = len(file["views"])
         except (OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: expected a shard of views, found {_short(error)}") from None
-        if recorded != json.loads(json.dumps(asdict(camera))):
-            raise InputError(f"{path}: expected views of {camera}, found {recorded}")
+        expected = recorded_with(camera, texture)
+        if found != expected:
+            raise InputError(f"{path}: expected views recorded with {expected}, found {found}")
         self._views: h5py.Dataset | None = None
 
     def __len__(self) -> int:
@@ -65,8 +80,12 @@ class Shard:
         try:
             if self._views is None:
                 self._views = h5py.File(self.path)["views"]
-            record = self._views[index]
-            return View(**{name: record[name] for name in _FIELDS})
+            record = np.empty(1, self._views.dtype)
+            place = self._views.id.get_space()
+            place.select_hyperslab((index,), (1,))
+            # read as the file's own type: into numpy's, HDF5 converts field by field, twice the time of all else
+            self._views.id.read(h5py.h5s.create_simple((1,)), place, record, self._views.id.get_type())
+            return View(**{name: record[0][name] for name in _FIELDS})
         except (OSError, KeyError) as error:
             raise InputError(f"{self.path}: expected view {index}, found {_short(error)}") from None
 
