@@ -1,16 +1,23 @@
 """The known part of the geometry, against the pinhole model."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.scenes_for_tests import build, furnished
 from zerobev.config import SCALES, CameraConfig
 from zerobev.errors import InputError
 from zerobev.models.band_transformer import sinusoids
+from zerobev.models.fpv_to_bev import reweigh
 from zerobev.models.polar import PolarToCartesian, band_rows
+from zerobev.sensors.cameras import Pose
+from zerobev.sensors.gbuffer import RayCaster
+from zerobev.streams.projection import cells_of_pixels, project
 
 EDGES = (0.0, 0.8, 2.0, 3.8, 5.0)
 cameras = st.builds(
@@ -77,6 +84,76 @@ def test_bands_tile_the_map_and_the_view_is_symmetric(camera):
         assert torch.equal(resample.weights.sum(-1).round(decimals=5), resample.valid.float())
         if camera.fpv_px % stride == 0:
             assert torch.allclose(resample.weights, resample.weights.flip(1, 2), atol=1e-6)
+
+
+@pytest.mark.parametrize("fpv", [96, 100])
+def test_points_of_the_ground_land_where_the_pinhole_model_says(fpv):
+    """Every cell reads its own place from the image, where the pinhole model puts that place of the floor.
+
+    The image holds x / z and 1 / z of the floor in each pixel. Both are linear in the pixel's position, so that
+    attention to the two image rows around the right one, and the resampler's interpolation, lose nothing.
+    """
+    camera = CameraConfig(fpv_px=fpv, bev_px=40, height_m=0.3)
+    focal = fpv / 2 / math.tan(math.radians(79) / 2)
+    for rows, stride, resample in resamplers(camera):
+        count = -(-fpv // stride)
+        centre = stride * (torch.arange(count) + 0.5)
+        offset = (centre - fpv / 2) / focal
+        floor = torch.stack([offset.expand(count, count), offset[:, None].expand(count, count) / 0.3])[None]
+        z = 5 - (torch.tensor(rows) + 0.5) * 0.125
+        at = ((fpv / 2 + focal * 0.3 / z) / stride - 0.5)[:, None]  # image row of the ground at depth z, in map pixels
+        attention = (1 - (at - torch.arange(count)).abs()).clamp(min=0)  # P R
+        seen = at[:, 0] <= count - 1
+        cells, valid = resample(reweigh(attention.expand(count, 2, -1, -1), floor))  # 1 P M 2
+        right = (torch.arange(40) + 0.5) * 0.125 - 2.5
+        u = fpv / 2 + focal * right / z[:, None]
+        inside = seen[:, None] & valid & (u >= centre[0]) & (u <= centre[-1])
+        assert inside.sum() > 10, "every band has cells whose ground is in the image"
+        x_over_z, inverse_z = cells[0].unbind(-1)
+        assert torch.allclose((1 / inverse_z)[inside], z[:, None].expand(-1, 40)[inside], atol=1e-3)
+        assert torch.allclose((x_over_z / inverse_z)[inside], right.expand(len(rows), -1)[inside], atol=1e-3)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("band", range(4))
+def test_true_correspondence_as_attention_gives_the_projection(band):
+    """Theorem 3.1's construction with depth from a G-buffer: the stream with identity values is P^-1.
+
+    Attention of a ray position is even over the pixels of its column that lie in the position's map row. Compared are
+    the cells where P^-1 knows one answer: their pixels, and those of the one or two columns that they are resampled
+    from, agree (average and maximum are then the same), and each of these columns has a pixel in the cell.
+    """
+    camera = CameraConfig(fpv_px=384, bev_px=40, height_m=0.4)
+    rows, stride = band_rows(camera, (0.0, 0.8, 2.0, 3.8, 5.0))[band], (32, 16, 8, 4)[band]
+    coarse = replace(camera, fpv_px=384 // stride)
+    depth = torch.from_numpy(RayCaster(build(furnished())).fpv(Pose(0.5, 2.6, 0.0, -0.1), coarse).distance)
+    side = coarse.fpv_px
+    zero = (torch.rand(1, 4, 5, 5, generator=torch.Generator().manual_seed(0)) > 0.5).float()
+    zero = F.interpolate(zero, (side, side), mode="nearest")  # four images, one a head
+    cell = cells_of_pixels(depth, camera=coarse)  # R C
+    member = (cell // 40)[None] == torch.tensor(rows)[:, None, None]  # P R C
+    attention = (member / member.sum(1, keepdim=True).clamp(min=1)).permute(2, 0, 1)  # C P R
+    rays = reweigh(attention[:, None].expand(-1, 4, -1, -1), zero)
+    found = PolarToCartesian(camera, rows, stride)(rays)[0].permute(0, 3, 1, 2)[0]  # 4 P M
+    expected = project(zero, depth[None, None], coarse)[0]
+
+    compared = []
+    for p, row in enumerate(rows):
+        z = (40 - row - 0.5) * camera.cell_m
+        for column in range(40):
+            u = 192 + camera.focal_px * ((column + 0.5) * camera.cell_m - 2.5) / z
+            at = min(max(u / stride - 0.5, 0), side - 1)
+            read = {int(at), min(int(at) + 1, side - 1)} if at % 1 else {int(at)}
+            inside = cell == 40 * row + column
+            if not 0 <= u <= 384 or not all(inside[:, c].any() for c in read):
+                continue
+            for k in range(4):
+                values = torch.cat([zero[0, k][inside], *(zero[0, k, member[p, :, c], c] for c in read)])
+                if values.unique().numel() == 1:
+                    compared.append((float(found[k, p, column]), float(expected[k, row, column])))
+    ours, theirs = torch.tensor(compared).T
+    assert len(ours) > 20 and 0 < theirs.mean() < 1
+    assert torch.allclose(ours, theirs, atol=1e-6)
 
 
 def test_the_paper_bands():

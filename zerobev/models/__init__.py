@@ -1,5 +1,20 @@
 """The networks: from a photograph and zero-shot images to maps."""
 
-from zerobev.models.zero_bev import BevModel, Projection, ZeroBEV
+from zerobev.models.checkpoint import BevModel, Projection
+from zerobev.models.tim import TIM
+from zerobev.models.two_streams import TwoStreamZeroBEV
+from zerobev.models.variants import VARIANTS, build, load_model
+from zerobev.models.vpn import VPN
+from zerobev.models.zero_bev import ZeroBEV
 
-__all__ = ["BevModel", "Projection", "ZeroBEV"]
+__all__ = [
+    "TIM",
+    "VARIANTS",
+    "VPN",
+    "BevModel",
+    "Projection",
+    "TwoStreamZeroBEV",
+    "ZeroBEV",
+    "build",
+    "load_model",
+]

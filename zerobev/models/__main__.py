@@ -1,15 +1,18 @@
-"""`python -m zerobev.models --scale paper`: the number of parameters, block by block, beside the paper's."""
+"""`python -m zerobev.models --scale paper`: the parameters of every network, block by block, beside the paper's."""
 
 import argparse
 from pathlib import Path
 
+import torch
 from torch import nn
 
 from zerobev.config import SCALES, scale
 from zerobev.errors import run_command
-from zerobev.models.zero_bev import ZeroBEV
+from zerobev.models.variants import VARIANTS, build
 from zerobev.paper import PARAMETERS_M
 from zerobev.storage import write_json
+
+BLOCKS = ("backbone", "zero_cnn", "pyramid", "bands", "view", "outs", "embedding", "decoder", "total")
 
 
 def parameters(network: nn.Module) -> dict[str, int]:
@@ -19,19 +22,22 @@ def parameters(network: nn.Module) -> dict[str, int]:
 
 
 def main() -> None:
-    """Print the table; with `--json`, write it too."""
+    """Print the table; with `--json`, write the total of every row too."""
     parser = argparse.ArgumentParser(prog="python -m zerobev.models", description=__doc__)
     parser.add_argument("--scale", default="paper", help=f"one of {', '.join(SCALES)} (default: paper)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the table to FILE")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write {row: parameters} to FILE")
     arguments = parser.parse_args()
     chosen = scale(arguments.scale)
-    table = parameters(ZeroBEV(chosen.camera, chosen.model))
-    published = round(PARAMETERS_M["c"] * 1e6)
-    for block, count in table.items():
-        print(f"{block:<10}{count:>12,}")
-    print(f"{'paper':<10}{published:>12,}  (Table 1, at scale paper)")
+    with torch.device("meta"):  # shapes without memory
+        tables = {row: parameters(build(row, chosen.camera, chosen.model)) for row in VARIANTS}
+    print(f"{'row':<5}{'network':<17}" + "".join(f"{block:>12}" for block in BLOCKS) + f"{'paper':>9}")
+    for row, table in tables.items():
+        counts = "".join(f"{table[block]:>12,}" if block in table else f"{'':>12}" for block in BLOCKS)
+        published = f"{PARAMETERS_M[row]:>7g} M" if row in PARAMETERS_M else ""
+        print(f"{row:<5}{VARIANTS[row][0].__name__:<17}{counts}{published}")
+    print("paper: Table 1, at scale paper; of (d) without the depth estimator")
     if arguments.json:
-        write_json(arguments.json, {"scale": chosen.name, "parameters": table, "paper_total": published})
+        write_json(arguments.json, {row: table["total"] for row, table in tables.items()})
 
 
 if __name__ == "__main__":

@@ -6,12 +6,16 @@ concatenated. Every layer halves a size n to ceil(n / 2), so odd sizes work and 
 
 from itertools import pairwise
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from transformers import ResNetBackbone, ResNetConfig
 
 from zerobev.config import ModelConfig
 from zerobev.errors import InputError
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def resnet(
@@ -42,14 +46,24 @@ def resnet(
     return network
 
 
-def rgb_backbone(model: ModelConfig) -> ResNetBackbone:
-    """The ResNet of the photograph, (B, 3, H, W) -> maps at strides `model.stem_stride` * (1, 2, 4, 8).
+class RgbEncoder(nn.Module):
+    """The ResNet of the photograph, normalised as ImageNet is; maps at strides `model.stem_stride` * (1, 2, 4, 8).
 
     Raises `InputError` for a stem stride other than 2 and 4.
     """
-    if model.stem_stride not in (2, 4):
-        raise InputError(f"stem_stride: expected 2 or 4, found {model.stem_stride}")
-    return resnet(3, model.stem_channels, model.channels, model.depths, model.block, max_pool=model.stem_stride == 4)
+
+    def __init__(self, model: ModelConfig):
+        super().__init__()
+        if model.stem_stride not in (2, 4):
+            raise InputError(f"stem_stride: expected 2 or 4, found {model.stem_stride}")
+        max_pool = model.stem_stride == 4
+        self.network = resnet(3, model.stem_channels, model.channels, model.depths, model.block, max_pool)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+
+    def forward(self, rgb: Tensor) -> tuple[Tensor, ...]:
+        """(B, 3, H, W) float32 in [0, 1] -> maps (B, channels[b], R_b, C_b), finest first."""
+        return self.network((rgb - self.mean) / self.std).feature_maps
 
 
 class ZeroCNN(nn.Module):
@@ -57,22 +71,22 @@ class ZeroCNN(nn.Module):
 
     At stem stride 2 this is the network of the paper's supplement, with maps at strides 2, 4, 8, 16. The paper also
     states backbone maps at strides 4 to 32, which four such layers cannot reach; at stem stride 4 the image is
-    therefore first folded 2 x 2 pixels into 4 channels, which halves its size and loses nothing.
+    therefore first folded, 2 x 2 pixels into 4 channels, which halves its size and loses nothing.
 
     There is no normalisation: the scale of the input means something, and an empty image is a usual one.
     """
 
-    def __init__(self, channels: tuple[int, int, int, int], stem_stride: int):
+    def __init__(self, channels: tuple[int, ...], stem_stride: int, in_channels: int = 1):
         super().__init__()
         self.fold = stem_stride // 2
-        widths = (self.fold**2, *channels)
+        widths = (in_channels * self.fold**2, *channels)
         self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
         for layer in self.layers:
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
 
     def forward(self, zero: Tensor) -> list[Tensor]:
-        """(N, 1, H, W) -> four maps (N, channels[b], ceil(H / stride_b), ceil(W / stride_b)), finest first."""
+        """(N, in_channels, H, W) -> maps (N, channels[b], ceil(H / stride_b), ceil(W / stride_b)), finest first."""
         height, width = zero.shape[-2:]
         padded = F.pad(zero, (0, -width % self.fold, 0, -height % self.fold))
         features = F.pixel_unshuffle(padded, self.fold)

@@ -1,0 +1,342 @@
+"""Every network of the paper's tables: size, contract, sharing, checkpoints, and that it can learn."""
+
+import json
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from zerobev.config import AUX, LABELS, SCALES, CameraConfig
+from zerobev.errors import InputError
+from zerobev.learning.losses import dice_loss, zero_bev_loss
+from zerobev.models import VARIANTS, BevModel, ZeroBEV, build, load_model
+from zerobev.models.__main__ import main, parameters
+from zerobev.models.fpv_to_bev import reweigh
+from zerobev.models.polar import band_rows
+from zerobev.paper import PARAMETERS_M
+from zerobev.streams.projection import map_points, project
+
+SMOKE = SCALES["smoke"]
+ROWS = list(VARIANTS)
+ZERO_SHOT = ["-", "c", "d", "e"]
+CLASSES = len(LABELS)
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+def network(row: str, camera: CameraConfig = SMOKE.camera, **changes) -> BevModel:
+    """A network of the smoke scale in evaluation mode, its batch norms with statistics unlike 0 and 1."""
+    net = build(row, camera, replace(SMOKE.model, **changes)).eval()
+    for module in net.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.uniform_(-0.2, 0.2)
+            module.running_var.uniform_(0.5, 2.0)
+    return net
+
+
+def inputs(batch: int, k: int = CLASSES, side: int = 32) -> tuple[Tensor, Tensor, Tensor]:
+    zero = (torch.rand(batch, k, side, side) > 0.7).float()
+    return torch.rand(batch, 3, side, side), zero, 0.3 + 5 * torch.rand(batch, 1, side, side)
+
+
+def views(n: int, camera: CameraConfig) -> dict[str, Tensor]:
+    """A batch of `n` views of a floor of coloured squares in front of a wall, cast by hand; the colour is the class.
+
+    The zero-shot image is white on three of the classes.
+    """
+    side, far = camera.bev_px, camera.bev_extent_m
+    wall = torch.linspace(2.2, 4.4, n)[:, None, None]
+    squares = torch.randint(0, CLASSES, (n, 5, 5))  # of 1 m
+    _, y, z = map_points(torch.ones(1, camera.fpv_px, camera.fpv_px), camera)[0].unbind(-1)
+    floor = camera.height_m / (camera.height_m - z).clamp(min=1e-3)  # depth at which a ray meets the floor
+    depth = torch.minimum(floor * y, wall)
+    x = map_points(depth, camera)[..., 0]
+    cells = (torch.arange(side) + 0.5) * camera.cell_m
+    cell_x, cell_z = torch.meshgrid(cells - far / 2, cells.flip(0), indexing="xy")
+
+    def label(x: Tensor, z: Tensor) -> Tensor:
+        row, column = (4 - z.floor().long()).clamp(0, 4), (x + far / 2).floor().long().clamp(0, 4)
+        return squares[torch.arange(n)[:, None, None], row, column]
+
+    cell_x, cell_z = cell_x.expand(n, -1, -1), cell_z.expand(n, -1, -1)
+    image, above = (
+        F.one_hot(label(*where), CLASSES).movedim(-1, 1).float() for where in ((x, depth), (cell_x, cell_z))
+    )
+    fov = (cell_z <= wall) & (cell_x.abs() <= cell_z * camera.fpv_px / 2 / camera.focal_px)
+    obstacle = (wall - cell_z).abs() < camera.cell_m
+    return {
+        "rgb": torch.einsum("nkhw,kc->nchw", image, torch.rand(CLASSES, 3)),
+        "depth": depth[:, None],
+        "classes": image,
+        "class_maps": above,
+        "zero": image[:, :3].sum(1, keepdim=True),
+        "target": above[:, :3].sum(1, keepdim=True),
+        "aux": torch.stack([obstacle, ~obstacle], dim=1).float(),
+        "fov": fov[:, None].float(),
+    }
+
+
+# --- size
+
+
+@pytest.mark.parametrize("row", PARAMETERS_M)
+def test_parameters_at_paper_scale_are_the_papers(row):
+    paper = SCALES["paper"]
+    with torch.device("meta"):
+        table = parameters(build(row, paper.camera, paper.model))
+    assert table["total"] == pytest.approx(PARAMETERS_M[row] * 1e6, rel=0.03)
+    if row != "b.1":
+        assert table["decoder"] == pytest.approx(5.20e6, rel=0.002)
+        assert table["bands"] == pytest.approx(8.97e6, rel=0.005)
+        assert table["backbone"] == pytest.approx(23.5e6, rel=0.002)
+
+
+def test_command_prints_every_block_and_writes_every_total(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "table.json"
+    monkeypatch.setattr(sys, "argv", ["models", "--scale", "smoke", "--json", str(file)])
+    main()
+    written, printed = json.loads(file.read_text()), capsys.readouterr().out
+    assert written == {row: sum(p.numel() for p in network(row).parameters()) for row in ROWS}
+    for count in parameters(network("d")).values():
+        assert f"{count:,}" in printed
+    monkeypatch.setattr(sys, "argv", ["models", "--scale", "huge"])
+    with pytest.raises(InputError, match="scale: expected"):
+        main()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ["b.1", "b.3", "d", "e"])
+def test_one_sample_passes_forward_and_backward_at_paper_scale(row):
+    paper = SCALES["paper"]
+    net = build(row, paper.camera, paper.model)
+    out = net(*inputs(1, CLASSES if row == "b.3" else 1, 384))
+    assert out.zero_logits.shape == (1, CLASSES if row[0] == "b" else 1, 100, 100)
+    sum(x.square().mean() for x in out if x is not None).backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
+
+
+# --- contract
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_shapes_and_gradients_reach_every_parameter(row):
+    net = network(row).train()
+    out = net(*inputs(2))
+    assert out.zero_logits.shape == (2, 8, 20, 20)
+    aux = net.config.aux
+    assert (out.aux_logits is None) if not aux else (out.aux_logits.shape == (2, len(aux), 20, 20))
+    sum(x.square().sum() for x in out if x is not None).backward()
+    assert [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "d", "e"])
+def test_a_batch_of_one_equals_a_batch_of_many(row):
+    net, images = network(row), inputs(3)
+    together = net(*images)
+    for i in range(3):
+        alone = net(*(image[i : i + 1] for image in images))
+        for ours, theirs in zip(alone, together):
+            assert ours is theirs is None or torch.allclose(ours[0], theirs[i], atol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("row", ["b.1", "b.3", "d", "e"])
+@pytest.mark.parametrize(("fpv", "bev", "stem"), [(97, 25, 4), (50, 33, 2)])
+def test_any_grid(row, fpv, bev, stem):
+    camera = CameraConfig(fpv_px=fpv, bev_px=bev, hfov_deg=62, bev_extent_m=4.0)
+    net = network(row, camera, stem_stride=stem, band_edges_m=(0, 0.7, 1.5, 2.9, 4.0))
+    out = net(*inputs(2, side=fpv))
+    assert out.zero_logits.shape == (2, 8, bev, bev) and out.zero_logits.isfinite().all()
+
+
+@pytest.mark.parametrize("row", ["b.1", "c", "e"])
+def test_a_batch_of_one_can_be_trained_on(row):
+    net = network(row).train()
+    net(*inputs(1)).zero_logits.sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
+
+
+@torch.no_grad()
+def test_who_reads_what():
+    """VPN and TIM see the photograph alone, TIM with segmentation the masks too; depth is the residual variant's."""
+    rgb, zero, depth = inputs(2)
+    for row, reads_zero, reads_depth in (
+        *(("b.1", False, False), ("b.2", False, False), ("b.3", True, False)),
+        *(("c", True, False), ("d", True, True), ("e", True, False)),
+    ):
+        net = network(row)
+        seen = net(rgb, zero, depth).zero_logits
+        assert torch.equal(net(rgb, zero.roll(1, 3), depth).zero_logits, seen) != reads_zero
+        assert torch.equal(net(rgb, zero, depth / 2).zero_logits, seen) != reads_depth
+        assert not torch.equal(net(rgb.roll(1, 3), zero, depth).zero_logits, seen)
+
+
+@pytest.mark.parametrize(
+    ("row", "bad", "named"),
+    [
+        ("b.1", {"rgb": (2, 3, 32, 30)}, "rgb"),
+        ("b.2", {"rgb": (2, 1, 32, 32)}, "rgb"),
+        ("b.3", {"zero": (2, 3, 32, 32)}, "zero"),
+        ("b.3", {"zero": None}, "zero"),
+        ("c", {"zero": (2, 32, 32)}, "zero"),
+        ("d", {"depth": None}, "depth"),
+        ("d", {"depth": (2, 1, 16, 16)}, "depth"),
+        ("e", {"zero": (1, 8, 32, 32)}, "zero"),
+    ],
+)
+def test_wrong_inputs_are_named(row, bad, named):
+    images = dict(zip(("rgb", "zero", "depth"), inputs(2)))
+    images |= {name: None if shape is None else torch.rand(shape) for name, shape in bad.items()}
+    with pytest.raises(InputError, match=f"^{named}: expected"):
+        network(row)(**images)
+
+
+def test_wrong_configurations_are_named():
+    with pytest.raises(InputError, match="aux: expected at least one"):
+        network("e", aux=())
+    for aux in (("floor",), AUX[::-1]):
+        with pytest.raises(InputError, match="aux: expected maps among"):
+            ZeroBEV(SMOKE.camera, replace(SMOKE.model, aux=aux))
+    with pytest.raises(InputError, match="band_edges_m: expected 5 depths"):
+        network("c", band_edges_m=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
+    with pytest.raises(InputError, match="row: expected one of"):
+        network("f")
+
+
+# --- several modalities
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("row", ZERO_SHOT)
+@pytest.mark.parametrize("batch", [1, 3])
+def test_modalities_share_the_photograph_and_nothing_else(row, batch):
+    net, (rgb, zero, depth), calls = network(row), inputs(batch), []
+    hook = net.backbone.register_forward_hook(lambda *_: calls.append(1))
+    together = net(rgb, zero, depth)
+    hook.remove()
+    assert len(calls) == 1
+    passes = [net(rgb, zero[:, k : k + 1], depth) for k in range(CLASSES)]
+    assert torch.allclose(together.zero_logits, torch.cat([p.zero_logits for p in passes], 1), atol=1e-5)
+    order = torch.randperm(CLASSES)
+    permuted = net(rgb, zero[:, order], depth)
+    assert torch.allclose(permuted.zero_logits, together.zero_logits[:, order], atol=1e-5)
+    if net.config.aux:
+        assert torch.allclose(together.aux_logits, torch.stack([p.aux_logits for p in passes]).mean(0), atol=1e-5)
+        assert torch.allclose(permuted.aux_logits, together.aux_logits, atol=1e-5)
+
+
+# --- residual variant
+
+
+@torch.no_grad()
+def test_the_residual_is_an_embedding_of_the_projection_added_to_the_map_features():
+    net, (rgb, zero, depth), seen = network("d"), inputs(2, 3), []
+    net.decoder.register_forward_pre_hook(lambda _, features: seen.append(features[0]))
+    net(rgb, zero, depth)
+    features, _ = net.bands(net.pyramid(net.fpv_maps(net.backbone(rgb), zero)))
+    known = project(zero, depth, net.camera).flatten(0, 1)[:, None]  # N 1 M M
+    assert 0.01 < known.mean() < 0.99
+    weight, bias = net.embedding.weight[:, 0], net.embedding.bias[:, None, None]
+    assert torch.allclose(seen[0], features + weight * known + bias, atol=1e-5)
+
+
+# --- inductive bias
+
+
+@torch.no_grad()
+def test_identity_values_are_the_columns_weighted_by_attention():
+    """Two photographs with three images each, written out: position p of column c holds its head's weighted sum."""
+    cross = torch.rand(2 * 5, 4, 6, 7).softmax(-1)
+    values = torch.rand(2 * 3, 8, 7, 5)
+    rays = reweigh(cross, values)
+    assert rays.shape == (6, 5, 6, 8)
+    for image, column, p, channel in ((0, 0, 0, 0), (2, 4, 5, 7), (3, 1, 2, 3), (5, 3, 0, 6)):
+        weights = cross[5 * (image // 3) + column, channel // 2, p]
+        assert torch.allclose(rays[image, column, p, channel], (weights * values[image, channel, :, column]).sum())
+
+
+@torch.no_grad()
+def test_attention_comes_from_the_photograph_alone():
+    """Auxiliary maps do not see the zero-shot image, zero-shot maps are linear in its features up to the U-Net."""
+    net, (rgb, zero, _), seen = network("e"), inputs(2, 1), []
+    assert torch.equal(net(rgb, zero).aux_logits, net(rgb, 1 - zero).aux_logits)
+    net.zero_cnn.register_forward_hook(lambda _m, _i, maps: [2 * features for features in maps])
+    net.decoder.register_forward_pre_hook(lambda _, features: seen.append(features[0][2:]))
+    net(rgb, zero)
+    net.zero_cnn._forward_hooks.clear()
+    net(rgb, zero)
+    net.zero_cnn.register_forward_hook(lambda _m, _i, maps: [0 * features for features in maps])
+    net(rgb, zero)
+    twice, once, none = seen
+    assert torch.allclose(twice - none, 2 * (once - none), atol=1e-5) and not torch.equal(once, none)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("row", ["b.2", "b.3", "d", "e"])
+def test_cross_attention_of_any_column_and_position(row):
+    net, (rgb, zero, _) = network(row), inputs(2, 8 if row == "b.3" else 1)
+    for attention, rows, count in zip(
+        net.attention(rgb, zero), band_rows(net.camera, net.config.band_edges_m), (2, 4, 8, 16)
+    ):
+        weights = attention.cross[-1].unflatten(0, (2, -1))
+        assert weights.shape == (2, count, 4, len(rows), count)
+        assert torch.allclose(weights.sum(-1), torch.ones(()), atol=1e-5)
+
+
+# --- checkpoints
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("row", ROWS)
+def test_a_checkpoint_needs_nothing_else(row, tmp_path):
+    net, images = network(row), inputs(2)
+    net.save(tmp_path / "a.safetensors")
+    loaded = load_model(tmp_path / "a.safetensors")
+    assert type(loaded) is type(net) and (loaded.camera, loaded.config) == (net.camera, net.config)
+    assert not loaded.training
+    for ours, theirs in zip(loaded(*images), net(*images)):
+        assert ours is theirs is None or torch.equal(ours, theirs)
+    loaded.to(memory_format=torch.channels_last).save(tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+def test_checkpoints_of_other_classes_are_named(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    network("b.2").save(path)
+    with pytest.raises(InputError, match=r"weights.safetensors: expected a checkpoint of ZeroBEV, found one of TIM"):
+        ZeroBEV.load(path)
+    described = json.dumps({"class": "Other", "camera": {}, "model": {}})
+    save_file(load_file(path), path, metadata={"zerobev": described})
+    with pytest.raises(
+        InputError, match=r"weights.safetensors: expected a checkpoint of VPN, TIM, .*found one of Other"
+    ):
+        load_model(path)
+
+
+# --- learning
+
+
+@pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "c", "d", "e"])
+def test_eight_views_are_learnt_by_heart(row):
+    """Far below the loss of ones everywhere, the best that knows nothing of the view."""
+    batch = views(8, SMOKE.camera)
+    if row[0] == "b":
+        batch |= {"zero": batch["classes"], "target": batch["class_maps"]}
+    trivial = float(dice_loss(torch.ones_like(batch["target"]), batch["target"], batch["fov"]))
+    net = network(row).train()
+    optimizer = torch.optim.Adam(net.parameters(), lr=1e-2, fused=True)
+    for _ in range(50):
+        losses = zero_bev_loss(net(batch["rgb"], batch["zero"], batch["depth"]), batch, 0.5, net.config.aux)
+        optimizer.zero_grad()
+        losses.total.backward()
+        optimizer.step()
+    assert losses.main < 0.6 * trivial

@@ -1,0 +1,59 @@
+"""Zero-BEV with the inductive bias (paper, Section 3.4, Eqs. 7 and 8; supplement, "Zero-BEV with inductive bias").
+
+photograph -> backbone -> pyramid -> transformers ---> map features -> U-Net -> auxiliary logits
+                                          : attention                    = (shared weights)
+zero-shot  -> zero CNN ------------> weighted sums --> map features -> U-Net -> zero-shot logits
+"""
+
+import torch
+from torch import Tensor, nn
+
+from zerobev.config import CameraConfig, ModelConfig
+from zerobev.errors import InputError
+from zerobev.models.backbone import RgbEncoder, ZeroCNN
+from zerobev.models.band_transformer import BandAttention
+from zerobev.models.checkpoint import IMAGES_A_PASS, BevModel, Projection
+from zerobev.models.decoder import BevDecoder
+from zerobev.models.fpv_to_bev import FpvToBev, reweigh
+from zerobev.models.pyramid import FeaturePyramid
+
+
+class TwoStreamZeroBEV(BevModel):
+    """Two streams with one attention (paper, Fig. 2e): where things are is read from the photograph alone.
+
+    The RGB stream is a transformer with queries, keys and values of its own. In the zero-shot stream queries and keys
+    are the RGB stream's, of the last cross-attention, and the values are the zero CNN's columns as they are; the
+    attention's output projection brings the heads together and to the width of the map. The two U-Nets share all
+    weights: each stream reads its own channels of the output. Attention does not depend on the zero-shot images, and is
+    computed once for all of them.
+
+    Raises `InputError` for a configuration without auxiliary maps, which alone train the RGB stream's values.
+    """
+
+    def __init__(self, camera: CameraConfig, model: ModelConfig):
+        super().__init__(camera, model)
+        if not model.aux:
+            raise InputError("aux: expected at least one map for the RGB stream to predict, found none")
+        self.backbone = RgbEncoder(model)
+        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride)
+        self.pyramid = FeaturePyramid(model.channels, model.width)
+        self.bands = FpvToBev(camera, model)
+        self.outs = nn.ModuleList(nn.Linear(c, model.width) for c in reversed(model.zero_channels))  # near band first
+        self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
+
+    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> Projection:
+        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `Projection`."""
+        batch = self.check(rgb=(rgb, 3), zero=(zero, None))
+        rgb_features, attention = self.bands(self.pyramid(self.backbone(rgb)))
+        zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])[::-1]  # near band first
+        zero_rays = [out(reweigh(band.cross[-1], m)) for out, band, m in zip(self.outs, attention, zero_maps)]
+        zero_features = self.bands.to_map(zero_rays)
+        # In training both streams pass together: one set of batch statistics, as in evaluation.
+        features = torch.cat([rgb_features, zero_features]).split(max(2 * batch, IMAGES_A_PASS))
+        logits = torch.cat([self.decoder(part) for part in features])
+        return Projection(logits[batch:, 0].unflatten(0, zero.shape[:2]), logits[:batch, 1:])
+
+    def attention(self, rgb: Tensor, zero: Tensor | None = None) -> list[BandAttention]:
+        """Attention of B photographs, near band first, laid out as `ZeroBEV.attention`; no zero-shot image counts."""
+        self.check(rgb=(rgb, 3))
+        return self.bands(self.pyramid(self.backbone(rgb)))[1]

@@ -1,0 +1,60 @@
+"""VPN, the *View Parsing Network* (Pan et al. 2020): no camera geometry, trained on the target classes (row (b.1))."""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from zerobev.config import LABELS, CameraConfig, ModelConfig
+from zerobev.models.backbone import RgbEncoder
+from zerobev.models.checkpoint import BevModel, Projection
+from zerobev.models.decoder import convolution, upsample
+
+POOLED_SIDES = (1, 2, 3, 6)  #: of the pyramid pooling
+
+
+class PyramidPooling(nn.Module):
+    """Averages over a map's parts at several sizes, beside the map itself (Zhao et al. 2017), to logits."""
+
+    def __init__(self, in_channels: int, width: int, out_channels: int, dropout: float):
+        super().__init__()
+        self.branches = nn.ModuleList(nn.Conv2d(in_channels, width, 1, bias=False) for _ in POOLED_SIDES)
+        self.norms = nn.ModuleList(nn.BatchNorm2d(width) for _ in POOLED_SIDES)
+        self.merge = convolution(in_channels + len(POOLED_SIDES) * width, width)
+        self.dropout = nn.Dropout2d(dropout)
+        self.head = nn.Conv2d(width, out_channels, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, in_channels, h, w) -> (N, out_channels, h, w)."""
+        parts = [features]
+        for side, branch, norm in zip(POOLED_SIDES, self.branches, self.norms):
+            pooled = branch(F.adaptive_avg_pool2d(features, side))
+            # Normalised at full size: a batch of one has a single value a channel where all is pooled into one.
+            parts.append(norm(upsample(pooled, features)).relu())
+        return self.head(self.dropout(self.merge(torch.cat(parts, dim=1))))
+
+
+class VPN(BevModel):
+    """From a photograph to maps of the eight classes, through fully connected layers from image to map positions.
+
+    Every channel of the backbone's third map, flattened, passes the same two layers; their output is taken for a coarse
+    map seen from above, which pyramid pooling turns into logits. The pooling is twice as wide as the other networks.
+    """
+
+    def __init__(self, camera: CameraConfig, model: ModelConfig):
+        super().__init__(camera, model)
+        self.backbone = RgbEncoder(replace(model, block="basic", depths=model.vpn_depths, channels=model.vpn_channels))
+        positions = (-(-camera.fpv_px // (model.stem_stride * 4))) ** 2
+        self.view = nn.Sequential(
+            nn.Linear(positions, positions), nn.ReLU(), nn.Linear(positions, positions), nn.ReLU()
+        )
+        self.decoder = PyramidPooling(model.vpn_channels[-1], 2 * model.width, len(LABELS), model.dropout)
+
+    def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> Projection:
+        """Photograph (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`."""
+        self.check(rgb=(rgb, 3))
+        features = self.backbone(rgb)[-1]
+        from_above = self.view(features.flatten(2)).unflatten(2, features.shape[2:])
+        size = (self.camera.bev_px, self.camera.bev_px)
+        return Projection(F.interpolate(self.decoder(from_above), size, mode="bilinear", align_corners=False), None)
