@@ -1,0 +1,329 @@
+"""Depth in metres: pairs to learn from, errors in closed form, our network, and models of the transformers library."""
+
+import json
+import re
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from transformers import (
+    BitConfig,
+    DepthAnythingConfig,
+    DepthAnythingForDepthEstimation,
+    Dinov2Config,
+    DPTConfig,
+    DPTForDepthEstimation,
+)
+
+from zerobev.config import SCALES, TrainConfig
+from zerobev.errors import InputError
+from zerobev.learning.depth import DepthErrors, DepthTuples, depth_errors, depth_objective, predict_depth, train_depth
+from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
+from zerobev.models.depth import FARTHEST_M, DepthNet, HubDepth
+from zerobev.models.weights import load_backbone
+from zerobev.streams.tuples import ViewSet
+from zerobev.streams.views import View
+
+SMOKE = SCALES["smoke"]
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+class Recorded:
+    """A shard of given photographs and depth maps."""
+
+    def __init__(self, rgb: np.ndarray, depth: np.ndarray):
+        self.rgb, self.depth = rgb, depth
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def view(self, index: int) -> View:
+        parts = dict.fromkeys((field.name for field in fields(View)), np.zeros(0))
+        return View(**parts | {"rgb": self.rgb[index], "depth": self.depth[index]})
+
+
+def recorded(*counts: int, side: int = 32) -> ViewSet:
+    """Photographs of random grey levels, brighter to the right, whose red channel tells the depth: red / 64 metres."""
+    rng = np.random.default_rng(0)
+    shards = []
+    for count in counts:
+        level = rng.integers(40, 160, (count, 1, 1)) + np.linspace(0, 80, side).astype(int) + np.zeros((side, 1), int)
+        rgb = np.stack([level, level // 2, level // 3], axis=-1).astype(np.uint8)
+        shards.append(Recorded(rgb, (rgb[..., 0] / 64).astype(np.float32)))
+    return ViewSet(shards)
+
+
+class Red(nn.Module):
+    """Knows how `recorded` is made, and errs by a factor; what it is given is kept."""
+
+    def __init__(self, factor: float = 1.0):
+        super().__init__()
+        self.factor = nn.Parameter(torch.tensor(factor))
+        self.noise = nn.Dropout(0.5)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        return self.noise(rgb[:, :1] * 255 / 64 * self.factor)
+
+
+# --- the stream ---------------------------------------------------------------------------------------------------
+
+
+def test_photograph_and_depth_are_mirrored_together_half_of_the_time():
+    batch = DepthTuples(recorded(30, 34), seed=0, batch=64).batch(0)
+    torch.testing.assert_close(batch["depth"], batch["rgb"][:, :1] * 255 / 64)
+    mirrored = batch["depth"][..., 0] > batch["depth"][..., -1]
+    assert 20 < int(mirrored[:, 0, 0].sum()) < 44
+
+
+def test_every_pass_shows_every_view_once_in_another_order():
+    views = recorded(5, 3)
+    levels = sorted(float(views.locate(i)[1].depth.mean()) for i in range(8))
+    passes = [DepthTuples(views, seed=1, batch=8).batch(step)["depth"].mean(dim=(1, 2, 3)) for step in (0, 1)]
+    assert not torch.equal(*passes)
+    for shown in passes:
+        np.testing.assert_allclose(np.sort(shown), levels, rtol=1e-6)
+
+
+def test_processes_share_a_batch():
+    data = DepthTuples(recorded(9), seed=3, batch=6)
+    whole, parts = data.batch(2), [data.batch(2, rank, 2) for rank in (0, 1)]
+    for name, tensor in whole.items():
+        assert torch.equal(tensor[::2], parts[0][name]) and torch.equal(tensor[1::2], parts[1][name])
+
+
+# --- objective, errors, prediction --------------------------------------------------------------------------------
+
+
+def test_the_objective_is_the_mean_absolute_difference_where_depth_is_known():
+    predicted = torch.tensor([1.0, 5.0, 9.0, 2.0], requires_grad=True)
+    batch = {"rgb": torch.zeros(1), "depth": torch.tensor([2.0, 2.0, 0.0, 0.0])}
+    losses = depth_objective(lambda rgb: predicted, batch)
+    losses.total.backward()
+    assert float(losses.total.detach()) == float(losses.main.detach()) == 2.0
+    assert predicted.grad.tolist() == [-0.5, 0.5, 0.0, 0.0]
+    nothing = depth_objective(lambda rgb: predicted, batch | {"depth": torch.zeros(4)})
+    assert float(nothing.total.detach()) == 0
+
+
+def test_errors_in_closed_form():
+    views = recorded(40, 3)
+    for shard in views.shards:
+        shard.depth[:, :7] = 0  # unknown
+    known = np.concatenate([shard.depth[shard.depth > 0] for shard in views.shards]).astype(np.float64)
+    errors = depth_errors(Red(1.25), views)
+    assert isinstance(errors, DepthErrors)
+    assert errors.mad_m == pytest.approx(0.25 * known.mean(), rel=1e-3)
+    assert errors.relative == pytest.approx(0.25, rel=1e-3)
+
+
+def test_prediction_replaces_the_depth_of_every_view():
+    views = recorded(2, 35, 1)
+    maps = predict_depth(Red(2.0), views)
+    assert [(a.shape, a.dtype) for a in maps] == [((n, 32, 32), np.float16) for n in (2, 35, 1)]
+    predicted = views.with_depth(maps)
+    for i in (0, 1, 2, 36, 37):
+        np.testing.assert_allclose(predicted.locate(i)[1].depth, 2 * views.locate(i)[1].depth, rtol=1e-3)
+
+
+def test_training_learns_and_keeps_the_weights_that_validated_best(tmp_path):
+    config = TrainConfig(steps=40, learning_rate=1e-2, decay_every=10, decay=0.5, validate_every=20, warmup=5, batch=8)
+    network = DepthNet(SMOKE.camera, SMOKE.model)
+    validation = recorded(12)
+    truth = np.concatenate([validation.locate(i)[1].depth for i in range(12)])
+    constant = np.abs(truth - np.median(truth)).mean()  # the best that knows nothing of the photograph
+    history = train_depth(network, recorded(24), validation, config, tmp_path, 0, key="toy", device="cpu")
+    error = depth_errors(network, validation).mad_m
+    assert error < 0.5 * constant
+    assert error == pytest.approx(history.best_score, rel=0.1)  # one in bfloat16, where the processor has it
+
+
+def test_a_run_in_two_parts_ends_with_the_same_weights(tmp_path):
+    def trained(folder: str, *steps: int) -> dict[str, torch.Tensor]:
+        for until in steps:
+            torch.manual_seed(1)
+            network = DepthNet(SMOKE.camera, SMOKE.model)
+            config = TrainConfig(steps=until, learning_rate=1e-2, decay_every=3, validate_every=2, batch=4)
+            train_depth(network, recorded(6), recorded(2), config, tmp_path / folder, 0, key="toy", device="cpu")
+        return network.state_dict()
+
+    whole, parts = trained("whole", 4), trained("parts", 2, 4)
+    assert all(torch.equal(tensor, parts[name]) for name, tensor in whole.items())
+
+
+# --- our network --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", [32, 45])
+@pytest.mark.parametrize("stem", [2, 4])
+def test_depth_has_the_size_of_the_photograph_and_each_pixel_sees_its_own(side, stem):
+    network = DepthNet(replace(SMOKE.camera, fpv_px=side), replace(SMOKE.model, stem_stride=stem)).eval()
+    rgb = torch.rand(2, 3, side, side, requires_grad=True)
+    depth = network(rgb)
+    assert depth.shape == (2, 1, side, side) and depth.dtype == torch.float32
+    assert ((depth > 0) & (depth <= FARTHEST_M)).all()
+    for pixel in ((0, 0), (side // 2, side // 3), (side - 1, side - 1)):
+        (gradient,) = torch.autograd.grad(depth[0, 0][pixel], rgb, retain_graph=True)
+        assert gradient[0, :, pixel[0], pixel[1]].abs().sum() > 0
+        assert gradient[1].abs().sum() == 0
+
+
+def test_the_network_knows_its_rays():
+    wide, narrow = (DepthNet(replace(SMOKE.camera, hfov_deg=hfov), SMOKE.model).eval() for hfov in (79, 50))
+    narrow.load_state_dict(wide.state_dict())
+    rgb = torch.rand(1, 3, 32, 32)
+    assert (wide(rgb) - narrow(rgb)).abs().max() > 1e-3
+    np.testing.assert_allclose(narrow.rays[0, 0, 0, -1], np.tan(np.radians(25)) * 31 / 32, rtol=1e-5)
+    np.testing.assert_allclose(narrow.rays[0, 1, 0, 0], -np.tan(np.radians(25)) * 31 / 32, rtol=1e-5)
+
+
+def test_a_photograph_of_another_size_is_refused():
+    with pytest.raises(InputError, match=r"rgb: expected \(1, 3, 32, 32\), found \(1, 3, 48, 48\)"):
+        DepthNet(SMOKE.camera, SMOKE.model)(torch.rand(1, 3, 48, 48))
+
+
+def test_a_checkpoint_gives_the_network_back_and_pretrains_a_backbone(tmp_path):
+    network = DepthNet(SMOKE.camera, SMOKE.model)
+    network(torch.rand(4, 3, 32, 32))  # moves the statistics of the batch norms
+    network.save(tmp_path / "depth.safetensors")
+    again = DepthNet.load(tmp_path / "depth.safetensors")
+    rgb = torch.rand(2, 3, 32, 32)
+    assert torch.equal(again(rgb), network.eval()(rgb))
+    backbone = RgbEncoder(SMOKE.model).eval()
+    load_backbone(backbone, tmp_path / "depth.safetensors")
+    for ours, theirs in zip(backbone(rgb), network.backbone(rgb), strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+# --- models of the transformers library ---------------------------------------------------------------------------
+
+
+def depth_anything(kind: str = "metric") -> DepthAnythingForDepthEstimation:
+    backbone = Dinov2Config(
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        mlp_ratio=2,
+        image_size=42,
+        patch_size=14,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+        apply_layernorm=True,
+    )
+    sizes = {"neck_hidden_sizes": [8, 8, 16, 16], "fusion_hidden_size": 8, "head_hidden_size": 8}
+    return DepthAnythingForDepthEstimation(
+        DepthAnythingConfig(
+            backbone_config=backbone, reassemble_hidden_size=16, depth_estimation_type=kind, max_depth=20, **sizes
+        )
+    )
+
+
+def dpt(**changes) -> DPTForDepthEstimation:
+    config = {
+        "hidden_size": 16,
+        "num_hidden_layers": 4,
+        "num_attention_heads": 2,
+        "intermediate_size": 32,
+        "image_size": 64,
+        "patch_size": 16,
+        "backbone_out_indices": [0, 1, 2, 3],
+        "neck_hidden_sizes": [8, 8, 16, 16],
+        "fusion_hidden_size": 8,
+    }
+    return DPTForDepthEstimation(DPTConfig(**config | changes))
+
+
+def dpt_hybrid() -> DPTForDepthEstimation:
+    backbone = BitConfig(
+        global_padding="same",
+        layer_type="bottleneck",
+        depths=[1, 1, 1],
+        hidden_sizes=[16, 32, 64],
+        embedding_size=16,
+        num_groups=4,
+        out_features=["stage1", "stage2", "stage3"],
+        embedding_dynamic_padding=True,
+    )
+    return dpt(
+        is_hybrid=True,
+        backbone_config=backbone,
+        backbone_featmap_shape=[1, 64, 4, 4],
+        neck_hidden_sizes=[16, 32, 16, 16],
+    )
+
+
+def seen_by(estimator: HubDepth) -> list[torch.Tensor]:
+    """What the network inside is given, call by call."""
+    seen: list[torch.Tensor] = []
+    estimator.network.register_forward_pre_hook(
+        lambda module, args, kwargs: seen.append(kwargs["pixel_values"]), with_kwargs=True
+    )
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("make", "side", "inner"),
+    [(depth_anything, 32, 42), (depth_anything, 42, 42), (dpt, 64, 64), (dpt, 60, 64), (dpt_hybrid, 48, 64)],
+)
+def test_a_folder_becomes_an_estimator_of_any_image_size(make, side, inner, tmp_path):
+    network = make().eval()
+    network.save_pretrained(tmp_path)
+    estimator = HubDepth.from_pretrained(tmp_path)
+    seen = seen_by(estimator)
+    rgb = torch.rand(2, 3, side, side)
+    with torch.no_grad():
+        depth = estimator(rgb)
+        alone = estimator(rgb[1:])
+        direct = network(pixel_values=seen[0]).predicted_depth
+    assert depth.shape == (2, 1, side, side) and seen[0].shape == (2, 3, inner, inner)
+    torch.testing.assert_close(depth[1:], alone, rtol=1e-4, atol=1e-5)
+    assert depth.mean() == pytest.approx(float(direct.mean()), rel=0.05)
+    if direct.shape[-2:] == (side, side):
+        torch.testing.assert_close(depth[:, 0], direct)
+
+
+@pytest.mark.parametrize("own", [None, ((0.5, 0.4, 0.3), (0.25, 0.5, 1.0))])
+def test_photographs_are_normalised_as_the_image_processor_does(own, tmp_path):
+    dpt().save_pretrained(tmp_path)
+    if own:
+        settings = {"image_processor_type": "DPTImageProcessor", "image_mean": own[0], "image_std": own[1]}
+        (tmp_path / "preprocessor_config.json").write_text(json.dumps(settings))
+    estimator = HubDepth.from_pretrained(tmp_path)
+    seen = seen_by(estimator)
+    rgb = torch.rand(1, 3, 64, 64)
+    estimator(rgb)
+    mean, std = (torch.tensor(values).view(3, 1, 1) for values in own or (IMAGENET_MEAN, IMAGENET_STD))
+    torch.testing.assert_close(seen[0], (rgb - mean) / std)
+
+
+@pytest.mark.parametrize("make", [depth_anything, dpt, dpt_hybrid])
+def test_fine_tuning_lowers_the_error(make, tmp_path):
+    estimator = HubDepth(make())
+    views = recorded(8)
+    before = depth_errors(estimator, views).mad_m
+    config = TrainConfig(steps=6, learning_rate=3e-3, decay_every=100, validate_every=3, batch=4)
+    train_depth(estimator, views, views, config, tmp_path, 0, key="tiny", device="cpu")
+    assert depth_errors(estimator, views).mad_m < before
+
+
+def test_relative_depth_is_refused(tmp_path):
+    depth_anything("relative").save_pretrained(tmp_path)
+    message = f"{tmp_path}: expected a model of metric depth, found one of relative depth"
+    with pytest.raises(InputError, match=re.escape(message)):
+        HubDepth.from_pretrained(tmp_path)
+
+
+def test_a_folder_that_lacks_a_weight_or_a_model_is_refused(tmp_path):
+    with pytest.raises(InputError, match=re.escape(str(tmp_path / "nothing"))):
+        HubDepth.from_pretrained(tmp_path / "nothing")
+    network = dpt()
+    lost = "head.head.0.weight"
+    network.save_pretrained(tmp_path, state_dict={k: v for k, v in network.state_dict().items() if k != lost})
+    with pytest.raises(InputError, match=rf"{re.escape(str(tmp_path))}: .*{re.escape(lost)}"):
+        HubDepth.from_pretrained(tmp_path)
