@@ -12,7 +12,7 @@ class Row:
     """One row of one of the paper's tables."""
 
     table: int
-    row: str  #: the paper's letter, or the value that the row varies
+    row: str  #: the paper's letter; where it has none, that of the model and what is varied
     method: str
     per_class: tuple[float, ...]  #: IoU of the eight classes
     class_iou: float  #: column "Avg."
@@ -54,50 +54,103 @@ TABLES: dict[int, dict[str, Row]] = {
     ),
     3: _rows(
         3,
-        ("gt", "GT depth", "11.2 57.4 26.0 39.2 38.5 16.9 15.5 15.2 27.5 56.8"),
-        ("predicted", "predicted depth", "11.7 52.0 27.1 38.8 37.7 18.6 15.0 15.5 27.1 57.2"),
+        ("d.gt", "GT depth", "11.2 57.4 26.0 39.2 38.5 16.9 15.5 15.2 27.5 56.8"),
+        ("d.predicted", "predicted depth", "11.7 52.0 27.1 38.8 37.7 18.6 15.0 15.5 27.1 57.2"),
         ("d", "GT, then predicted depth", _D),
     ),
     4: _rows(
         4,
-        ("10%", "10 % white", "7.9 56.0 23.7 34.3 33.9 11.4 12.7 7.7 23.5 58.5"),
-        ("15%", "15 % white", "8.7 56.4 23.6 35.6 35.0 11.2 12.9 7.4 23.9 58.8"),
+        ("c.10", "10 % white", "7.9 56.0 23.7 34.3 33.9 11.4 12.7 7.7 23.5 58.5"),
+        ("c.15", "15 % white", "8.7 56.4 23.6 35.6 35.0 11.2 12.9 7.4 23.9 58.8"),
         ("c", "20 % white", _C),
-        ("25%", "25 % white", "7.3 59.1 23.4 35.1 34.8 10.6 12.6 6.7 23.7 58.5"),
-        ("30%", "30 % white", "8.0 57.4 23.3 34.7 35.1 10.4 13.4 6.1 23.6 60.4"),
+        ("c.25", "25 % white", "7.3 59.1 23.4 35.1 34.8 10.6 12.6 6.7 23.7 58.5"),
+        ("c.30", "30 % white", "8.0 57.4 23.3 34.7 35.1 10.4 13.4 6.1 23.6 60.4"),
     ),
     5: _rows(
         5,
         ("c", "Synth (20 %)", _C),
-        ("modsem", "Mod.Sem. (30 %)", "5.0 60.1 20.4 31.2 32.3 8.3 10.5 4.7 21.6 48.9"),
-        ("depthproj", "Depth proj.", "8.7 32.2 22.5 29.5 27.8 12.4 13.9 7.7 19.3 41.7"),
+        ("c.modsem", "Mod.Sem. (30 %)", "5.0 60.1 20.4 31.2 32.3 8.3 10.5 4.7 21.6 48.9"),
+        ("c.depthproj", "Depth proj.", "8.7 32.2 22.5 29.5 27.8 12.4 13.9 7.7 19.3 41.7"),
     ),
 }
 
-#: parameters of each model, in millions (Table 1)
-PARAMETERS_M = {"c": 41.0, "b.1": 15.0, "b.2": 41.0, "b.3": 41.0}
+#: parameters of each network, in millions (Table 1); of (d) without those of the depth estimator
+PARAMETERS_M = {"b.1": 15.0, "b.2": 41.0, "b.3": 41.0, "c": 41.0, "d": 41.0}
+
+#: errors of the fine-tuned depth estimator of (a.2) and (d): metres, and relative to the true depth (supplement)
+DEPTH_ERRORS = {"mad_m": 0.13, "relative": 0.08}
 
 
 @dataclass(frozen=True)
-class Ordering:
-    """A claim that one row beats another on a metric: "class", "pixel", or the name of a class."""
+class Claim:
+    """A sentence of the paper about its numbers: the gain of one row over another, or the spread of several.
 
-    id: str
-    table: int
-    better: str
-    worse: str
+    metric: "class" or "pixel" average, the name of a class, or "objects", the mean of the six object classes
+    """
+
+    id: str  #: table and number
     metric: str
     text: str
 
+    @property
+    def table(self) -> int:
+        """The table that the claim is about; its id begins with it."""
+        return int(self.id.split(".")[0])
 
-#: The orderings that the paper states about Table 1 (its Section 4).
-ORDERINGS = (
-    Ordering("1.1", 1, "c", "a.2", "class", "Zero-BEV beats the projection with estimated depth on class IoU"),
-    Ordering("1.2", 1, "c", "a.2", "pixel", "Zero-BEV beats the projection with estimated depth on pixel IoU"),
-    Ordering("1.3", 1, "c", "a.2", "floor", "... most of all on floor, which it infers where it is hidden"),
-    Ordering("1.4", 1, "c", "a.1", "pixel", "Zero-BEV beats even the projection with GT depth on pixel IoU"),
-    Ordering("1.5", 1, "d", "c", "class", "the residual model beats the base model on class IoU"),
-    Ordering("1.6", 1, "d", "b.2", "class", "the residual model beats TIM on class IoU"),
-    Ordering("1.7", 1, "c", "b.1", "class", "Zero-BEV beats VPN on class IoU"),
-    Ordering("1.8", 1, "b.3", "c", "class", "TIM with the segmentation as input bounds the learned methods"),
+
+@dataclass(frozen=True)
+class Ordering(Claim):
+    """`better` beats `worse`."""
+
+    better: str
+    worse: str
+
+
+@dataclass(frozen=True)
+class Similar(Claim):
+    """The rows lie within `points` of each other: from the lowest to the highest."""
+
+    rows: tuple[str, ...]
+    points: float  #: IoU points, twice the spread in the paper's own table
+
+
+#: What the paper says about its tables (its Section 4), in their order.
+CLAIMS: tuple[Ordering | Similar, ...] = (
+    Ordering("1.1", "class", "Zero-BEV beats the projection with estimated depth on class IoU", "c", "a.2"),
+    Ordering("1.2", "pixel", "Zero-BEV beats the projection with estimated depth on pixel IoU", "c", "a.2"),
+    Ordering("1.3", "floor", "... most of all on floor, which it infers where it is hidden", "c", "a.2"),
+    Ordering("1.4", "pixel", "Zero-BEV beats even the projection with GT depth on pixel IoU", "c", "a.1"),
+    Ordering("1.5", "class", "the residual model beats the base model on class IoU", "d", "c"),
+    Ordering("1.6", "class", "the residual model beats TIM on class IoU", "d", "b.2"),
+    Ordering("1.7", "class", "Zero-BEV beats VPN on class IoU", "c", "b.1"),
+    Ordering("1.8", "class", "TIM with the segmentation as input bounds the learned methods", "b.3", "d"),
+    Ordering("2.1", "class", "auxiliary supervision helps the base model", "c", "-"),
+    Ordering("2.2", "class", "auxiliary supervision helps the residual model", "d", "d.I"),
+    Similar("2.3", "class", "which binary channel is supervised hardly matters", ("c.I", "c.II"), 0.8),
+    Ordering("2.4", "class", "the inductive bias does not help where there is max-pooling", "c", "e"),
+    Ordering("3.1", "class", "training on GT depth, then on predicted depth, beats GT depth alone", "d", "d.gt"),
+    Ordering(
+        "3.2", "class", "training on GT depth, then on predicted depth, beats predicted depth alone", "d", "d.predicted"
+    ),
+    Similar("4.1", "class", "the share of white matter matters little", ("c.10", "c.15", "c", "c.25", "c.30"), 1.4),
+    Ordering("5.1", "class", "Synth beats Mod.Sem.", "c", "c.modsem"),
+    Ordering("5.2", "class", "Mod.Sem. beats Depth proj.", "c.modsem", "c.depthproj"),
+    Ordering("5.3", "floor", "Mod.Sem. is better than Synth on floor", "c.modsem", "c"),
+    Ordering("5.4", "objects", "Mod.Sem. is worse than Synth on objects", "c", "c.modsem"),
+)
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A quotient of two rows of Table 1: it compares across data sets, which single numbers do not."""
+
+    numerator: str
+    denominator: str
+    metric: str
+
+
+RATIOS = tuple(
+    Ratio(numerator, denominator, metric)
+    for numerator, denominator in (("c", "a.1"), ("d", "a.1"), ("c", "b.3"), ("d", "b.3"))
+    for metric in ("class", "pixel")
 )

@@ -1,7 +1,6 @@
-"""Records and the paper's numbers -> tables, verdicts on claims, and the figures that notebooks share."""
+"""Records and the paper's numbers -> the tables and figures that notebooks share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -9,10 +8,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from zerobev.claims import Verdict
 from zerobev.config import LABELS, CameraConfig
-from zerobev.errors import InputError
-from zerobev.learning.metrics import Statistic, bootstrap_difference, class_iou, iou_per_class, pixel_iou
-from zerobev.paper import Ordering, Row
+from zerobev.paper import Row
 from zerobev.records import Record
 from zerobev.scenes.scene import Scene
 from zerobev.sensors.cameras import Pose
@@ -25,9 +23,6 @@ _OUTSIDE = "#ffffff"
 
 # claims are sentences: a table shows them whole
 pd.set_option("display.max_colwidth", None)
-
-_DRAWS = 1000
-_LEVEL = 0.9
 
 
 def table(rows: dict[str, Row], records: Sequence[Record]) -> pd.DataFrame:
@@ -48,60 +43,10 @@ def table(rows: dict[str, Row], records: Sequence[Record]) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=columns).set_index(["row", "method", "source"]).round(1)
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """A claim of the paper, held against our records."""
-
-    id: str
-    table: int
-    claim: str
-    paper: float  #: difference in IoU points
-    ours: float | None
-    low: float | None  #: 90 % interval over test scenes
-    high: float | None
-    verdict: str  #: "holds", "does not hold", "undecided", or "not run"
-
-
-def judge(claim: Ordering, rows: dict[str, Row], records: Sequence[Record]) -> Verdict:
-    """Whether the better row is better here too: the interval of the paired difference lies on one side of zero.
-
-    The runs must be on the same test scenes, else it is an `InputError`.
-    """
-    published = _published(rows[claim.better], claim.metric) - _published(rows[claim.worse], claim.metric)
-    runs = [record for record in records if record.row in (claim.better, claim.worse)]
-    if len({tuple(run.scenes) for run in runs}) > 1:
-        raise InputError(
-            f"records of {claim.better} and {claim.worse}: expected runs on the same test scenes, found others"
-        )
-    better, worse = ([run.counts for run in runs if run.row == row] for row in (claim.better, claim.worse))
-    named = f"({claim.better}) > ({claim.worse}), {claim.metric} IoU: {claim.text}"
-    if not better or not worse:
-        return Verdict(claim.id, claim.table, named, round(published, 1), None, None, None, "not run")
-    statistic = _statistic(claim.metric)
-    ours = np.mean([c.value(statistic) for c in better]) - np.mean([c.value(statistic) for c in worse])
-    low, high = bootstrap_difference(better, worse, statistic, np.random.default_rng(0), _LEVEL, _DRAWS)
-    verdict = "holds" if low > 0 else "does not hold" if high < 0 else "undecided"
-    points = (round(100 * float(value), 1) for value in (ours, low, high))
-    return Verdict(claim.id, claim.table, named, round(published, 1), *points, verdict)
-
-
 def verdict_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
     """Claims and verdicts for a notebook, differences in IoU points."""
     frame = pd.DataFrame([vars(verdict) for verdict in verdicts]).set_index("id").drop(columns="table")
     return frame.astype({"ours": float, "low": float, "high": float})
-
-
-def _published(row: Row, metric: str) -> float:
-    if metric in LABELS:
-        return row.per_class[LABELS.index(metric)]
-    return row.class_iou if metric == "class" else row.pixel_iou
-
-
-def _statistic(metric: str) -> Statistic:
-    if metric in LABELS:
-        column = LABELS.index(metric)
-        return lambda intersection, union: iou_per_class(intersection, union)[..., column]
-    return {"class": class_iou, "pixel": pixel_iou}[metric]
 
 
 def label_image(label: np.ndarray, fov: np.ndarray | None = None) -> np.ndarray:

@@ -133,36 +133,25 @@ def bootstrap_interval(
     statistic: `class_iou`, `pixel_iou` or `iou_per_class`, or another function of (..., K) counts
     Returns the lower and upper end that enclose the share `level` of `draws` draws.
     """
-    return _interval(_resampled(counts, statistic, _weights(counts, rng, draws)), level)
+    (values,) = resampled_scenes([counts], statistic, rng, draws)
+    low, high = np.nanquantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return low, high
 
 
-def bootstrap_difference(
-    ours: Sequence[Counts],
-    theirs: Sequence[Counts],
-    statistic: Statistic,
-    rng: np.random.Generator,
-    level: float = 0.9,
-    draws: int = 1000,
-) -> tuple[np.ndarray, np.ndarray]:
-    """As `bootstrap_interval`, of the difference `ours - theirs`, paired: both are resampled in the same scenes."""
-    weights = _weights([*ours, *theirs], rng, draws)
-    return _interval(_resampled(ours, statistic, weights) - _resampled(theirs, statistic, weights), level)
+def resampled_scenes(
+    rows: Sequence[Sequence[Counts]], statistic: Statistic, rng: np.random.Generator, draws: int
+) -> list[np.ndarray]:
+    """The statistic's mean over seeds of several rows, (draws, ...) each, under resampling of test scenes.
 
-
-def _weights(counts: Sequence[Counts], rng: np.random.Generator, draws: int) -> np.ndarray:
-    """(draws, S): how often each scene is in each draw."""
-    scenes = {len(one.union) for one in counts}
+    rows: counts of each row, one a seed, all of the same scenes. They are paired: draw i takes the same scenes from
+    all rows and seeds, so that differences and quotients of rows have intervals of their own.
+    """
+    scenes = {len(one.union) for counts in rows for one in counts}
     if len(scenes) != 1 or 0 in scenes:
         raise InputError(f"counts: expected the same scenes in all, found {sorted(scenes)} scenes")
     (size,) = scenes
-    return rng.multinomial(size, np.full(size, 1 / size), size=draws)
-
-
-def _resampled(counts: Sequence[Counts], statistic: Statistic, weights: np.ndarray) -> np.ndarray:
-    """(draws, ...): mean of the statistic over seeds."""
-    return np.mean([statistic(weights @ one.intersection, weights @ one.union) for one in counts], axis=0)
-
-
-def _interval(values: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.nanquantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    return low, high
+    weights = rng.multinomial(size, np.full(size, 1 / size), size=draws)  # how often each scene is in each draw
+    return [
+        np.mean([statistic(weights @ one.intersection, weights @ one.union) for one in counts], axis=0)
+        for counts in rows
+    ]
