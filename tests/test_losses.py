@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor, distributed, multiprocessing
 
+from zerobev.errors import InputError
 from zerobev.learning.losses import dice_loss, zero_bev_loss
 
 UNIT = st.floats(0, 1, width=32)
@@ -91,6 +92,17 @@ def test_streams_are_weighed_by_alpha():
     alone = zero_bev_loss(Maps(zero, None), batch, alpha=0.25)
     assert alone.total == alone.main == zero_dice
     assert alone.aux is None
+
+
+def test_a_model_of_one_auxiliary_map_is_held_against_its_own():
+    aux = torch.randn(2, 1, 4, 4, generator=torch.Generator().manual_seed(1))
+    truth = torch.cat([aux < 0, aux > 0], dim=1).float()
+    batch = {"target": truth[:, :1], "aux": truth, "fov": torch.ones(2, 1, 4, 4)}
+    maps = Maps(aux, 99 * aux)
+    assert zero_bev_loss(maps, batch, 0.5, aux=("navigable",)).aux < 0.1
+    assert zero_bev_loss(maps, batch, 0.5, aux=("obstacles",)).aux > 0.9
+    with pytest.raises(InputError, match=r"expected the target's shape \(2, 2, 4, 4\), found \(2, 1, 4, 4\)"):
+        zero_bev_loss(maps, batch, 0.5)
 
 
 def test_float32_under_autocast():

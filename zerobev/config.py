@@ -13,6 +13,8 @@ from zerobev.errors import InputError
 LABELS = ("wall", "floor", "chair", "sofa", "bed", "plant", "toilet", "tv")
 #: Label value of everything that is none of the eight classes.
 NO_LABEL = -1
+#: The auxiliary maps, in the order of their channels in a batch.
+AUX = ("obstacles", "navigable")
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,9 @@ class TextureConfig:
     kernel_px: tuple[int, int] = (10, 30)  #: smallest and largest kernel of opening and dilation
     tile_px: int = 1024  #: side of a tile of the texture bank
     tiles: int = 32  #: number of tiles in the bank
+    #: structures are this many times smaller, drawn log-uniformly for each sample; equal ends are a fixed scale
+    scales: tuple[float, float] = (1.0, 1.0)
+    modsem_share: float = 0.30  #: of white texels in *Mod. Sem.* textures
 
 
 @dataclass(frozen=True)
@@ -90,16 +95,20 @@ class ModelConfig:
     zero_channels: tuple[int, int, int, int]  #: of the small CNN of the zero-shot stream
     ffn: tuple[int, int, int, int]  #: hidden width of the feed-forward layers, a band
     decoder_channels: tuple[int, int, int]  #: ResNet stages of the BEV decoder
+    vpn_depths: tuple[int, int, int]  #: residual blocks, "basic", in each stage of VPN's smaller backbone
+    vpn_channels: tuple[int, int, int]  #: output channels of these stages
     heads: int = 4
     layers: int = 2  #: of the column encoder, and of the ray decoder
     dropout: float = 0.1
     band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)
-    aux: tuple[str, ...] = ("obstacles", "navigable")  #: auxiliary maps predicted beside the zero-shot map
+    aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
+    residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
+    segmentation: bool = False  #: the masks of the eight classes are an input (TIM, row (b.3))
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Optimisation (paper, "Implementation and training details")."""
+    """Optimisation with Adam (paper, "Implementation and training details")."""
 
     steps: int
     learning_rate: float
@@ -110,6 +119,7 @@ class TrainConfig:
     patience: int = 3  #: validations without progress before the learning rate is halved
     batch: int = 16
     alpha: float = 0.5  #: weight of the auxiliary loss
+    weight_decay: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -121,7 +131,11 @@ class Scale:
     scenes: SceneConfig
     model: ModelConfig
     train: TrainConfig
+    depth: TrainConfig  #: of the depth estimator
     texture: TextureConfig = field(default_factory=TextureConfig)
+    #: first weights of the RGB backbones, as `models.weights.load_backbone` takes them; empty: the depth estimator's
+    backbone: str = ""
+    vpn_backbone: str = ""
 
 
 SCALES = {
@@ -141,9 +155,12 @@ SCALES = {
                 zero_channels=(8, 8, 16, 16),
                 ffn=(32, 32, 32, 32),
                 decoder_channels=(16, 32, 32),
+                vpn_depths=(1, 1, 1),
+                vpn_channels=(16, 16, 32),
                 dropout=0.0,
             ),
             train=TrainConfig(steps=240, learning_rate=1e-3, decay_every=80, validate_every=80, warmup=20),
+            depth=TrainConfig(steps=120, learning_rate=3e-3, decay_every=12, decay=0.75, validate_every=40, warmup=10),
             texture=TextureConfig(tiles=8, tile_px=512),
         ),
         Scale(
@@ -153,16 +170,19 @@ SCALES = {
             model=ModelConfig(
                 width=32,
                 block="basic",
-                depths=(1, 1, 1, 1),
-                channels=(16, 32, 48, 64),
+                depths=(1, 2, 2, 2),
+                channels=(16, 32, 64, 128),
                 stem_channels=16,
                 stem_stride=2,
                 zero_channels=(16, 32, 32, 32),
                 ffn=(64, 64, 64, 64),
                 decoder_channels=(32, 48, 64),
+                vpn_depths=(1, 2, 2),
+                vpn_channels=(16, 32, 64),
                 dropout=0.0,
             ),
             train=TrainConfig(steps=500, learning_rate=1.2e-3, decay_every=150, validate_every=100, warmup=30),
+            depth=TrainConfig(steps=3000, learning_rate=2e-3, decay_every=100, validate_every=500, warmup=50, batch=32),
         ),
         Scale(
             name="paper",
@@ -178,9 +198,21 @@ SCALES = {
                 zero_channels=(16, 32, 64, 64),
                 ffn=(128, 128, 512, 512),
                 decoder_channels=(64, 128, 256),
+                vpn_depths=(2, 2, 2),
+                vpn_channels=(64, 128, 256),
             ),
             train=TrainConfig(steps=18_125 * 20, learning_rate=1e-4, decay_every=18_125, validate_every=18_125),
+            depth=TrainConfig(
+                steps=30_625 * 20,
+                learning_rate=1e-5,
+                decay_every=30_625,
+                validate_every=30_625,
+                batch=32,
+                weight_decay=2e-6,
+            ),
             texture=TextureConfig(tiles=256, tile_px=2048),
+            backbone="microsoft/resnet-50",
+            vpn_backbone="microsoft/resnet-18",
         ),
     )
 }

@@ -58,7 +58,7 @@ class RecordStore:
         Raises `InputError` for a file that is no record.
         """
         path = self.path(key)
-        if not path.exists() or path.stat().st_mtime < float(os.environ.get("ZEROBEV_FRESH", 0)):
+        if not path.exists() or not is_fresh(path):
             return None
         try:
             found = json.loads(path.read_text())
@@ -100,6 +100,11 @@ class RecordStore:
 
     def _maps_path(self, key: str) -> Path:
         return self._gallery / f"{key}.npz"
+
+
+def is_fresh(path: Path) -> bool:
+    """Whether a file is younger than the call for fresh results, `make reproduce FRESH=1`, if there was one."""
+    return path.stat().st_mtime >= float(os.environ.get("ZEROBEV_FRESH", 0))
 
 
 def git_revision() -> str:

@@ -16,9 +16,10 @@ import numpy as np
 
 from zerobev import config
 from zerobev.errors import InputError, run_command
-from zerobev.experiments import TABLE_1, compute, run_key
+from zerobev.experiments import EXPERIMENTS
 from zerobev.learning.metrics import bootstrap_interval, class_iou, pixel_iou
 from zerobev.records import Record, RecordStore
+from zerobev.runs import compute, run_key
 from zerobev.workspace import Workspace
 
 _SEED = 0
@@ -51,11 +52,11 @@ class SpotCheck:
 def spot_check(workspace: Workspace, row: str | None = None, day: date | None = None) -> SpotCheck:
     """Compute one recorded run again, in a temporary folder.
 
-    row: a row of Table 1; by default the recorded rows take turns, a day each (`day` is today if not given).
+    row: one of `EXPERIMENTS`; by default the recorded rows take turns, a day each (`day` is today if not given).
     Raises `InputError` for a row that has no record.
     """
     store = RecordStore(workspace.reports)
-    found = {e: store.find(run_key(e, workspace, _SEED)) for e in TABLE_1}
+    found = {e: store.find(run_key(e, workspace, _SEED)) for e in EXPERIMENTS.values()}
     recorded = {experiment.row: (experiment, record) for experiment, record in found.items() if record is not None}
     rows = list(recorded)
     if not rows or (row is not None and row not in rows):

@@ -13,18 +13,19 @@ from typing import Any
 import numpy as np
 
 from zerobev import config
+from zerobev.config import TextureConfig
 from zerobev.errors import InputError
 from zerobev.scenes.hm3dsem import Split, read_scene, split_scenes
 from zerobev.scenes.homes import ensure_home, ensure_homes, home_folders
 from zerobev.scenes.scene import Scene
 from zerobev.streams.generate import generate, shard_path
-from zerobev.streams.shards import Shard
+from zerobev.streams.shards import Shard, recorded_with
 from zerobev.streams.sources import SourceImages
 from zerobev.streams.textures import TextureBank
 from zerobev.streams.tuples import ViewSet
 
 #: Raised by hand whenever homes, sensors or textures change what they make: stale data is then left aside.
-DATA_VERSION = 1
+DATA_VERSION = 2
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -41,7 +42,7 @@ class Workspace:
         self.reports = root / "reports" / (f"{scale}-{self.source.name}-scenes" if self.source else scale)
         textures = os.environ.get("ZEROBEV_TEXTURES")  # set by `make reproduce TEXTURES=...`
         self._textures = Path(textures) if textures else None
-        self._cache = root / ".cache"
+        self.cache = root / ".cache"
         self._workers = os.cpu_count() or 1
 
     @property
@@ -49,7 +50,7 @@ class Workspace:
         """What the views depend on, as plain data: it is part of a record's key."""
         identity = {
             "version": DATA_VERSION,
-            "camera": asdict(self.scale.camera),
+            **recorded_with(self.scale.camera, self.scale.texture),
             "scenes": asdict(self.scale.scenes),
         }
         if self.source:
@@ -57,23 +58,22 @@ class Workspace:
             identity["source"] = {f.name: f.stat().st_size for f in files}
         return identity
 
-    @property
-    def texture_identity(self) -> dict[str, Any]:
-        """What the texture bank depends on, as plain data."""
+    def texture_identity(self, texture: TextureConfig) -> dict[str, Any]:
+        """What a texture bank depends on, as plain data."""
         source = self._textures.name if self._textures else "procedural"
-        return {"version": DATA_VERSION, "sources": source, **asdict(self.scale.texture)}
+        return {"version": DATA_VERSION, "sources": source, **asdict(texture)}
 
     @property
     def runs(self) -> Path:
         """Folder of checkpoints and logs."""
-        return self._cache / "runs" / self.reports.name
+        return self.cache / "runs" / self.reports.name
 
     @property
     def split(self) -> Split:
         """Folders of the training, validation and test scenes; generated ones may not be written yet."""
         if self.source:
             return split_scenes(self.source)
-        return home_folders(self._cache / f"homes-{DATA_VERSION}-{self.scale.scenes.seed}", self.scale.scenes)
+        return home_folders(self.cache / f"homes-{DATA_VERSION}-{self.scale.scenes.seed}", self.scale.scenes)
 
     def scene(self, part: str, index: int) -> Scene:
         """Scene number `index` of the split `part` ("train", "validation" or "test")."""
@@ -89,23 +89,23 @@ class Workspace:
         """
         folders = list(getattr(self.split, part)[:scenes])
         seed = self.scale.scenes.seed + ("train", "validation", "test").index(part)
-        out = self._cache / f"views-{fingerprint(self.identity)}" / part
+        out = self.cache / f"views-{fingerprint(self.identity)}" / part
         if not all(shard_path(folder, out).exists() for folder in folders):
             if not self.source:
                 ensure_homes(folders, self.scale.scenes.seed, self._workers)
             views = self.scale.scenes.views
-            broken = generate(folders, out, views, self.scale.camera, seed, self._workers)
+            broken = generate(folders, out, views, self.scale.camera, self.scale.texture, seed, self._workers)
             if broken:
                 raise InputError("; ".join(broken.values()))
-        return ViewSet([Shard(shard_path(folder, out), self.scale.camera) for folder in folders])
+        return ViewSet([Shard(shard_path(f, out), self.scale.camera, self.scale.texture) for f in folders])
 
-    def bank(self) -> TextureBank:
-        """The texture bank of this scale, made of DTD's images where there are some, else of procedural ones."""
-        path = self._cache / f"textures-{fingerprint(self.texture_identity)}.npz"
+    def bank(self, texture: TextureConfig | None = None) -> TextureBank:
+        """A texture bank, by default of this scale's textures; from DTD's images or procedural ones."""
+        texture = texture or self.scale.texture
+        path = self.cache / f"textures-{fingerprint(self.texture_identity(texture))}.npz"
         if not path.exists():
             sources = SourceImages(self._textures)
-            bank = TextureBank.build(self.scale.texture, sources, np.random.default_rng(self.scale.scenes.seed))
-            bank.save(path)
+            TextureBank.build(texture, sources, np.random.default_rng(self.scale.scenes.seed)).save(path)
         return TextureBank.load(path)
 
 

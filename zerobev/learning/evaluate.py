@@ -33,11 +33,16 @@ def evaluate(
 def model_projector(model: nn.Module, device: torch.device | str) -> Projector:
     """A learned model as a projector: moved to `device`, in evaluation mode, in float32.
 
-    The model is called as `model(rgb, zero)` and returns logits as `zero_logits`.
+    The model is called as `model(rgb, zero, depth)`, depth where the batch has it, and returns logits as `zero_logits`.
     """
     model = model.to(device).eval()
 
     def project(batch: Batch) -> Tensor:
-        return model(batch["rgb"].to(device), batch["zero"].to(device)).zero_logits
+        return model(*(image.to(device) for image in model_inputs(batch))).zero_logits
 
     return project
+
+
+def model_inputs(batch: Batch) -> list[Tensor]:
+    """What a model is called with: `rgb`, `zero`, and `depth` where the batch has it."""
+    return [batch[name] for name in ("rgb", "zero", "depth") if name in batch]

@@ -6,6 +6,9 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, distributed
 
+from zerobev.config import AUX
+from zerobev.errors import InputError
+
 EPSILON = 1e-6  #: keeps the Dice ratio of an empty class finite
 
 
@@ -35,8 +38,12 @@ def dice_loss(probabilities: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     probabilities: (B, K, M, M) in [0, 1]
     target: (B, K, M, M) in {0, 1}
     mask: (B, 1, M, M) in {0, 1}; cells where it is 0 do not count
-    Returns a scalar float32 in [0, 1], also under autocast.
+    Returns a scalar float32 in [0, 1], also under autocast. Raises `InputError` where the shapes disagree.
     """
+    if probabilities.shape != target.shape:
+        raise InputError(
+            f"probabilities: expected the target's shape {tuple(target.shape)}, found {tuple(probabilities.shape)}"
+        )
     with torch.autocast(probabilities.device.type, enabled=False):
         predicted, truth = probabilities.float() * mask.float(), target.float() * mask.float()
         both = (truth * predicted).sum(dim=(0, 2, 3))  # K
@@ -45,18 +52,22 @@ def dice_loss(probabilities: Tensor, target: Tensor, mask: Tensor) -> Tensor:
         return 1 - (2 * both / (either + EPSILON)).mean()
 
 
-def zero_bev_loss(projection: Projection, batch: Mapping[str, Tensor], alpha: float) -> Losses:
-    """Dice loss of the zero-shot stream, and of the auxiliary maps with weight `alpha` where the model has them.
+def zero_bev_loss(
+    projection: Projection, batch: Mapping[str, Tensor], alpha: float, aux: tuple[str, ...] = AUX
+) -> Losses:
+    """Dice loss of the main maps, and of the auxiliary maps with weight `alpha` where the model has them.
 
     projection: logits (B, K, M, M) and, or None, (B, A, M, M), before the FOV mask
-    batch: `target` (B, K, M, M), `aux` (B, A, M, M) if the model predicts it, `fov` (B, 1, M, M)
-    alpha: weight of the auxiliary loss, in [0, 1]; without auxiliary maps the zero-shot loss stands alone
+    batch: `target` (B, K, M, M), `aux` (B, 2, M, M) in the order of `AUX` if the model predicts it, `fov` (B, 1, M, M)
+    alpha: weight of the auxiliary loss, in [0, 1]; without auxiliary maps the main loss stands alone
+    aux: names of the A maps that the model predicts, its `config.aux`
     """
     zero = dice_loss(projection.zero_logits.float().sigmoid(), batch["target"], batch["fov"])
     if projection.aux_logits is None:
         return Losses(zero, zero)
-    aux = dice_loss(projection.aux_logits.float().sigmoid(), batch["aux"], batch["fov"])
-    return Losses((1 - alpha) * zero + alpha * aux, zero, aux)
+    true_aux = batch["aux"][:, [AUX.index(name) for name in aux]]
+    aux_loss = dice_loss(projection.aux_logits.float().sigmoid(), true_aux, batch["fov"])
+    return Losses((1 - alpha) * zero + alpha * aux_loss, zero, aux_loss)
 
 
 def _over_processes(sums: Tensor) -> Tensor:

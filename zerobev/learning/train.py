@@ -24,8 +24,9 @@ from safetensors.torch import save_model
 from torch import Tensor, nn
 from torch.optim import Optimizer, lr_scheduler
 
-from zerobev.config import TrainConfig
+from zerobev.config import AUX, TrainConfig
 from zerobev.errors import InputError
+from zerobev.learning.evaluate import model_inputs
 from zerobev.learning.losses import Losses, zero_bev_loss
 from zerobev.progress import progress
 from zerobev.storage import replacing
@@ -45,7 +46,7 @@ class Source(Protocol):
         """The share of process `rank` of `ranks` in the batch of `step`.
 
         The batch holds the samples `step * n ... (step + 1) * n - 1`, n = `TrainConfig.batch`; a process gets every
-        `ranks`-th of them, from `rank` on. Depends on nothing else, is called from another thread, and does not
+        `ranks`-th of them, from `rank` on. Depends on nothing else, may be called from another thread, and does not
         touch torch's global generator.
         """
 
@@ -71,6 +72,12 @@ class History:
     best_step: int  #: whose weights were kept
     best_score: float
     seconds: float
+
+    def curves(self) -> dict[str, list[float | None]]:
+        """Columns of the history, thinned to about a hundred entries beside those at validations: for a record."""
+        stride = max(len(self.entries) // 100, 1)
+        kept = [e for i, e in enumerate(self.entries) if i % stride == 0 or e.validation is not None]
+        return {name: [getattr(e, name) for e in kept] for name in ("step", "loss", "main", "aux", "validation")}
 
 
 class Schedule:
@@ -106,9 +113,12 @@ class Schedule:
             scheduler.load_state_dict(state)
 
 
-def dice_objective(alpha: float) -> Objective:
-    """The Zero-BEV loss of a model that is called as `model(rgb, zero)` and returns a `Projection`."""
-    return lambda model, batch: zero_bev_loss(model(batch["rgb"], batch["zero"]), batch, alpha)
+def dice_objective(alpha: float, aux: tuple[str, ...] = AUX) -> Objective:
+    """The Zero-BEV loss of a model that is called as `model(rgb, zero, depth)` and returns a `Projection`.
+
+    aux: names of the auxiliary maps that the model predicts, if it predicts any; depth is given where a batch has it
+    """
+    return lambda model, batch: zero_bev_loss(model(*model_inputs(batch)), batch, alpha, aux)
 
 
 def train(
@@ -143,7 +153,7 @@ def train(
         run = _Run(model, config, folder, key, accelerator)
         try:
             run.resume()
-            with closing(_prefetched(data, run.step, config.steps, accelerator)) as batches:
+            with closing(_batches(data, run.step, config.steps, accelerator)) as batches:
                 shown = progress(batches, "training", "step", config.steps, done=run.step)
                 for batch in shown if accelerator.is_main_process else batches:
                     torch.manual_seed(_step_seed(seed, run.step, accelerator.process_index))
@@ -165,7 +175,9 @@ class _Run:
     def __init__(self, model: nn.Module, config: TrainConfig, folder: Path, key: str, accelerator: Accelerator) -> None:
         self.bare = model
         self.config, self.folder, self.key, self.accelerator = config, folder, key, accelerator
-        optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
+        optimizer = torch.optim.Adam(
+            model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+        )
         self.schedule = Schedule(optimizer, config)
         self.model, self.optimizer = accelerator.prepare(model, optimizer)
         self.step = 0
@@ -298,9 +310,16 @@ def _read_checkpoint(path: Path, key: str) -> dict[str, Any] | None:
     return state
 
 
-def _prefetched(data: Source, first: int, steps: int, accelerator: Accelerator) -> Iterator[Batch]:
-    """Batches of the steps `first` to `steps - 1`; each is made in a second thread during the step before it."""
+def _batches(data: Source, first: int, steps: int, accelerator: Accelerator) -> Iterator[Batch]:
+    """Batches of the steps `first` to `steps - 1`.
+
+    For a GPU each is made in a second thread during the step before it. Not so on a CPU: a thread more than there are
+    cores leaves the others waiting for each other, and made a step ten times slower.
+    """
     place = accelerator.process_index, accelerator.num_processes
+    if accelerator.device.type == "cpu":
+        yield from (data.batch(step, *place) for step in range(first, steps))
+        return
     with ThreadPoolExecutor(max_workers=1) as executor:
         ahead = (executor.submit(data.batch, step, *place) for step in range(first, steps))
         coming = next(ahead, None)

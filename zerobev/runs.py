@@ -1,0 +1,158 @@
+"""The one way to get a run's record: read it, or compute it."""
+
+import time
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from zerobev.config import LABELS
+from zerobev.experiments import Experiment
+from zerobev.gallery import gallery_indices
+from zerobev.learning.evaluate import Projector, evaluate, model_projector
+from zerobev.learning.train import History, Source, train
+from zerobev.models.checkpoint import BevModel
+from zerobev.models.variants import build
+from zerobev.models.vpn import VPN
+from zerobev.models.weights import load_backbone
+from zerobev.pretraining import DepthPretraining
+from zerobev.records import Record, RecordStore, git_revision, origin, peak_memory_mb
+from zerobev.streams.projection import project
+from zerobev.streams.tuples import (
+    DepthProjTuples,
+    ModSemTuples,
+    SemanticTuples,
+    SynthTuples,
+    ViewSet,
+    collate,
+    semantic_batches,
+    semantic_sample,
+)
+from zerobev.workspace import Workspace, fingerprint
+
+#: Raised by hand whenever training or evaluation change what they compute: older records are then left aside.
+RECIPE_VERSION = 2
+
+VALIDATION_BATCHES = 4
+_EVALUATION_BATCH = 16
+
+
+def run(experiment: Experiment, workspace: Workspace, seed: int = 0) -> Record:
+    """The record of an experiment: read where there is one, else computed and kept.
+
+    A computation that was killed goes on where it was. Training takes the training and validation scenes;
+    the test scenes are touched once, by the weights that validated best.
+    """
+    store = RecordStore(workspace.reports)
+    return store.find(run_key(experiment, workspace, seed)) or compute(experiment, workspace, seed, store)
+
+
+def run_key(experiment: Experiment, workspace: Workspace, seed: int) -> str:
+    """Name of a run: row, seed, and the fingerprint of all it depends on."""
+    return f"{experiment.row}-seed{seed}-{fingerprint(_config(experiment, workspace))}"
+
+
+def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
+    scale = workspace.scale
+    config = {"experiment": asdict(experiment), "data": workspace.identity, "recipe": RECIPE_VERSION}
+    if experiment.network is not None or experiment.test_depth == "predicted":
+        config["depth"] = DepthPretraining(workspace).key
+    if experiment.network is not None:
+        texture = workspace.texture_identity(experiment.texture(scale))
+        config |= {"model": asdict(scale.model), "backbone": scale.backbone}
+        config |= {"train": asdict(scale.train), "texture": texture}
+    return config
+
+
+def compute(experiment: Experiment, workspace: Workspace, seed: int, store: RecordStore) -> Record:
+    """Train, evaluate and keep the record in `store`, whether there is one or not."""
+    key = run_key(experiment, workspace, seed)
+    revision = git_revision()  # of the code that is at work now, whatever is committed in the meantime
+    pretraining = DepthPretraining(workspace)
+    history: History | None = None
+    if experiment.network is None:
+        projector: Projector = _projection(workspace)
+        device = "cpu"
+    else:
+        model, history = train_run(experiment, workspace, seed, key)
+        device = next(model.parameters()).device.type
+        projector = model_projector(model, device)
+    predicted = experiment.reads_depth and experiment.test_depth == "predicted"
+    test = pretraining.views("test") if predicted else workspace.views("test")
+    trained = time.monotonic()
+    batches = semantic_batches(test, workspace.scale.camera, _EVALUATION_BATCH)
+    counts = evaluate(projector, batches, len(test.shards), len(LABELS))
+    record = Record(
+        key=key,
+        row=experiment.row,
+        seed=seed,
+        config=_config(experiment, workspace),
+        origin=origin(device, revision),
+        cost={
+            "train_seconds": round(history.seconds if history else 0.0, 1),
+            "evaluate_seconds": round(time.monotonic() - trained, 1),
+            "peak_memory_mb": peak_memory_mb(),
+        },
+        scenes=[shard.scene for shard in test.shards],
+        counts=counts,
+        history=history.curves() if history else {},
+    )
+    batch = collate([semantic_sample(test, i, workspace.scale.camera) for i in gallery_indices(test)])
+    with torch.inference_mode():
+        maps = projector(batch).cpu()
+    store.write(record, ((maps if maps.dtype == torch.bool else maps > 0) & (batch["fov"] > 0.5)).numpy())
+    # the record is complete: a later call for a fresh one starts from the first step
+    (workspace.runs / key / "checkpoint.pt").unlink(missing_ok=True)
+    return record
+
+
+def _projection(workspace: Workspace) -> Projector:
+    """Rows (a): P^-1 with the depth that the batch brings."""
+    return lambda batch: project(batch["zero"], batch["depth"], workspace.scale.camera) > 0
+
+
+def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str) -> tuple[BevModel, History]:
+    """A network with its best weights; also written to the run's folder as `model.safetensors`.
+
+    Its RGB backbone starts from the scale's pretrained weights, all else from the seed. Validation is on the stream
+    that it is trained on, with the depth of the last stage, and with one fixed seed, so that scores of runs compare.
+    """
+    scale = workspace.scale
+    torch.manual_seed(seed)
+    model = build(experiment.network, scale.camera, scale.model)
+    source = scale.vpn_backbone if isinstance(model, VPN) else scale.backbone
+    load_backbone(model.backbone, source or DepthPretraining(workspace).weights)
+    folder = workspace.runs / key
+    stages = [stream(experiment, workspace, "train", depth, seed) for depth in _stages(experiment)]
+    held_out = stream(experiment, workspace, "validation", _stages(experiment)[-1], seed=0)
+    validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]
+    history = train(model, InTurn(stages, scale.train.steps), validation, scale.train, folder, seed, key=key)
+    model.save(folder / "model.safetensors")
+    return model, history
+
+
+def _stages(experiment: Experiment) -> tuple[str, ...]:
+    return experiment.train_depth if experiment.reads_depth else ("gt",)
+
+
+def stream(experiment: Experiment, workspace: Workspace, part: str, depth: str, seed: int) -> Source:
+    """The tuples of a split that an experiment trains on; depth: "gt" or "predicted"."""
+    views: ViewSet = DepthPretraining(workspace).views(part) if depth == "predicted" else workspace.views(part)
+    common = (workspace.scale.camera, seed, workspace.scale.train.batch)
+    if experiment.stream == "synth":
+        return SynthTuples(views, workspace.bank(experiment.texture(workspace.scale)), *common, experiment.fresh)
+    return {"modsem": ModSemTuples, "depthproj": DepthProjTuples, "classes": SemanticTuples}[experiment.stream](
+        views, *common
+    )
+
+
+class InTurn:
+    """Training data of several stages, one after the other, each with an equal share of the steps."""
+
+    def __init__(self, stages: list[Source], steps: int) -> None:
+        self._stages, self._steps = stages, steps
+
+    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, torch.Tensor]:
+        """The batch of a step, from the stage that the step belongs to."""
+        stage = self._stages[min(step * len(self._stages) // self._steps, len(self._stages) - 1)]
+        return stage.batch(step, rank, ranks)
