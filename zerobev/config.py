@@ -179,9 +179,10 @@ SCALES = {
                 decoder_channels=(32, 48, 64),
                 vpn_depths=(1, 2, 2),
                 vpn_channels=(16, 32, 64),
+                layers=1,
                 dropout=0.0,
             ),
-            train=TrainConfig(steps=500, learning_rate=1.2e-3, decay_every=150, validate_every=100, warmup=30),
+            train=TrainConfig(steps=800, learning_rate=1.2e-3, decay_every=150, validate_every=100, warmup=30),
             depth=TrainConfig(steps=3000, learning_rate=2e-3, decay_every=100, validate_every=500, warmup=50, batch=32),
         ),
         Scale(

@@ -25,6 +25,9 @@ from zerobev.workspace import Workspace, fingerprint
 #: Raised by hand whenever depth training changes what it computes.
 DEPTH_VERSION = 1
 
+#: What the network is made of, among the fields of `ModelConfig`.
+_FIELDS = ("width", "block", "depths", "channels", "stem_channels", "stem_stride")
+
 _SEED = 0  # one estimator serves all seeds of all runs
 
 
@@ -42,7 +45,7 @@ class DepthPretraining:
         self.config: dict[str, Any] = {
             "version": DEPTH_VERSION,
             "data": workspace.identity,
-            "model": asdict(scale.model),
+            "model": {name: getattr(scale.model, name) for name in _FIELDS},
             "train": asdict(scale.depth),
         }
 
