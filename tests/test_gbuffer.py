@@ -5,12 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
+from PIL import Image
 from scenes_for_tests import TEXEL_M, box, build, furnished, real_home, room
 from scipy import ndimage
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from zerobev.config import AgentConfig, CameraConfig
 from zerobev.scenes.indoor import generate_home
 from zerobev.scenes.scene import Scene
+from zerobev.sensors import photograph
 from zerobev.sensors.cameras import Pose, bev_cell_centres, fpv_rays
 from zerobev.sensors.gbuffer import GBuffer, RayCaster
 from zerobev.sensors.photograph import Photographer
@@ -157,6 +162,21 @@ def test_texel_is_the_point_that_is_seen(pose):
         assert np.array_equal(owner, seen.instance[hit])
 
 
+@pytest.mark.parametrize("pose", POSES)
+def test_atlas_index_is_the_texel(pose):
+    """Charts laid end to end, and one more place for nothing."""
+    scene = build(furnished())
+    laid_out = [
+        np.stack([np.full(image.shape, chart), *np.indices(image.shape)], axis=-1).reshape(-1, 3)
+        for chart, image in enumerate(scene.chart_instance)
+    ]
+    texels = np.concatenate([*laid_out, [(-1, -1, -1)]])
+    caster = RayCaster(scene)
+    for seen in (caster.fpv(pose, CAMERA), caster.bev(pose, CAMERA)):
+        assert np.array_equal(texels[seen.atlas], seen.texel)
+    assert (caster.bev(pose, CAMERA).atlas == len(texels) - 1).any()
+
+
 HOMES = {
     "hand-made": lambda: build(furnished()),
     "generated": lambda: generate_home("Home", np.random.default_rng(0)),
@@ -241,14 +261,14 @@ def test_ray_caster_and_rasteriser_agree_on_depth(home):
 def test_photograph_shows_what_the_ray_caster_sees(pose):
     """A pixel of the photograph is the mean of the colours that rays through it meet, also at borders."""
     scene, fine = build(furnished()), 8
-    photograph = Photographer(scene, CAMERA).take(pose).astype(float)
+    photo = Photographer(scene, CAMERA).take(pose).astype(float)
     seen = RayCaster(scene).fpv(pose, replace(CAMERA, fpv_px=fine * CAMERA.fpv_px))
     color = np.array([(0, 0, 0), *(instance.color for instance in scene.instances)])[seen.instance]
 
     def difference(down: int, right: int) -> np.ndarray:
         moved = np.roll(color, (down, right), axis=(0, 1))
         blocks = moved.reshape(CAMERA.fpv_px, fine, CAMERA.fpv_px, fine, 3)
-        return np.abs(photograph - blocks.mean(axis=(1, 3))).max(axis=-1)
+        return np.abs(photo - blocks.mean(axis=(1, 3))).max(axis=-1)
 
     plain = ndimage.generic_filter(seen.instance[::fine, ::fine], np.ptp, 3) == 0
     assert plain.mean() > 0.7
@@ -256,6 +276,47 @@ def test_photograph_shows_what_the_ray_caster_sees(pose):
     # a quarter of a pixel to any side is worse already
     for move in ((2, 0), (-2, 0), (0, 2), (0, -2)):
         assert difference(*move).mean() > 1.2 * difference(0, 0).mean()
+
+
+def picture(left: float, rows: int, columns: int, colors: list[tuple], repeats: int = 1) -> trimesh.Trimesh:
+    """A square of 0.8 m, 2 m before `EASEL`, from `left` metres on; an image of four quadrants, so many times."""
+    corners = [(2, -left - across, 0.48 + up) for across, up in ((0, 0), (0.8, 0), (0.8, 0.8), (0, 0.8))]
+    image = np.zeros((rows, columns, 3), np.uint8)
+    for quadrant, color in zip(np.ndindex(2, 2), colors):
+        image[tuple(slice(k * (n // 2), None) for k, n in zip(quadrant, image.shape))] = color
+    material = PBRMaterial(baseColorTexture=Image.fromarray(image), doubleSided=False)
+    visual = TextureVisuals(repeats * np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), material=material)
+    return trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], visual=visual, process=False)
+
+
+EASEL = Pose(0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("atlas_px", [8192, 24, 8])
+def test_each_texture_is_where_it_belongs(atlas_px, monkeypatch):
+    """Images of any width, in one atlas or several, once or repeated, keep their colours and places."""
+    monkeypatch.setattr(photograph, "_ATLAS_PX", atlas_px)
+    rng = np.random.default_rng(0)
+    colors = rng.integers(0, 256, (4, 4, 3))
+    places = [(-1.6, 10, 10, 1), (-0.8, 14, 6, 1), (0, 6, 18, 2), (0.8, 22, 10, 1)]
+    meshes = [picture(left, rows, columns, c, n) for (left, rows, columns, n), c in zip(places, colors)]
+    scene = replace(build(room(SIZE)), photograph=trimesh.Scene(meshes))
+    camera = replace(CAMERA, fpv_px=256)
+    photo = Photographer(scene, camera).take(EASEL).astype(int)
+    for (left, _, _, repeats), quadrants in zip(places, colors):
+        for down, right in np.ndindex(2 * repeats, 2 * repeats):
+            x, y = (0.8 * (k + 0.5) / (2 * repeats) for k in (right, down))
+            column, row = (
+                camera.focal_px * at / 2 + camera.fpv_px / 2 for at in (left + x, camera.height_m - 1.28 + y)
+            )
+            shown, expected = photo[int(row), int(column)], quadrants[2 * (down % 2) + right % 2]
+            assert np.abs(shown - expected).max() <= 1
+    # nothing of a neighbour at the rims: an upper quadrant each
+    for (left, _, _, _), quadrants in zip(places, colors):
+        row = int(camera.focal_px * (camera.height_m - 1.28 + 0.1) / 2 + camera.fpv_px / 2)
+        for x, column_of in ((0.02, 0), (0.78, 1)):
+            column = int(camera.focal_px * (left + x) / 2 + camera.fpv_px / 2)
+            assert np.abs(photo[row, column] - quadrants[column_of]).max() <= 1
 
 
 def test_photographers_of_two_scenes_and_sizes_take_turns():

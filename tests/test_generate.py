@@ -1,5 +1,6 @@
 """Generation: the same bytes whoever works, nothing redone, nothing damaged that goes unnoticed."""
 
+import gc
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import trimesh
 from dask.distributed import LocalCluster
 from scenes_for_tests import build, furnished, room
 
@@ -133,6 +135,22 @@ def test_shards_of_another_run_are_not_taken_for_this_one(folders, recorded, tmp
     assert "expected" in broken[folders[0].name] and str(shard) in broken[folders[0].name]
     assert shard.read_bytes() == (recorded / shard.name).read_bytes()
     assert json.loads((tmp_path / "manifest.json").read_text())["shards"] == {}
+
+
+def meshes_alive() -> int:
+    return sum(type(thing) is trimesh.Scene for thing in gc.get_objects())
+
+
+def test_scenes_do_not_pile_up_in_a_worker(folders, tmp_path):
+    """Meshes refer to themselves, and hold the images of their textures."""
+    gc.collect()
+    before = meshes_alive()
+    gc.disable()
+    try:
+        generate(folders, tmp_path, VIEWS, CAMERA, TEXTURE, SEED)
+        assert meshes_alive() == before
+    finally:
+        gc.enable()
 
 
 def test_a_part_of_the_scenes_leaves_the_others_in_the_manifest(folders, recorded, tmp_path):

@@ -89,6 +89,24 @@ def test_poses_that_see_too_little_are_refused(scene):
         views_of(build(room((1.3, 1.3, 2.5))))
 
 
+def test_a_glance_refuses_what_a_large_image_would(scene):
+    """Up to the rim of the image, which a glance sees half of its own, larger pixels narrower."""
+    camera = replace(CAMERA, fpv_px=200)
+    source, caster, rng = (
+        ViewSource(scene, camera, TEXTURE, np.random.default_rng(0)),
+        RayCaster(scene),
+        np.random.default_rng(1),
+    )
+    seen, taken = [], []
+    for _ in range(60):
+        pose = source.floor.draw(rng)
+        seen.append(fov_mask(caster.fpv(pose, camera).distance, camera).mean())
+        taken.append(source.at(pose) is not None)
+    seen, taken = np.array(seen), np.array(taken)
+    assert 10 < taken.sum() < 50
+    assert taken[seen >= 0.12].all() and not taken[seen < 0.1].any()
+
+
 def test_a_shard_travels_to_another_process_while_open(scene, views, tmp_path):
     write_shard(tmp_path / "a.h5", scene, views, CAMERA, TEXTURE, SEED)
     shard = Shard(tmp_path / "a.h5", CAMERA, TEXTURE)

@@ -46,30 +46,41 @@ def home_folder(root: Path, number: int) -> Path:
     return folder
 
 
-def view_rates(folder: Path, setting: Scale, repeats: int, seconds: float) -> tuple[float, list[float]]:
-    """Seconds from a home's folder to its first view, and complete views a second in each of `repeats` stretches."""
+def view_rates(folder: Path, setting: Scale, repeats: int, seconds: float) -> tuple[float, np.ndarray]:
+    """How fast one worker draws the complete views of a home.
+
+    Returns the seconds from the home's folder to its first view, and (repeats, 2) views a second of wall time and of
+    processor time, in each of `repeats` stretches.
+    """
     torch.set_num_threads(1)
     _views(folder, setting)  # imports, and shaders that are compiled once a process
     start = time.perf_counter()
     _, source = _views(folder, setting)
     set_up = time.perf_counter() - start
-    rates = []
-    for _ in range(repeats):
-        drawn, start = 0, time.perf_counter()
-        while (passed := time.perf_counter() - start) < seconds:
+    rates = np.empty((repeats, 2))
+    for rate in rates:
+        drawn, wall, processor = 0, time.perf_counter(), time.process_time()
+        while time.perf_counter() - wall < seconds:
             source.draw()
             drawn += 1
-        rates.append(drawn / passed)
+        rate[:] = drawn / (time.perf_counter() - wall), drawn / (time.process_time() - processor)
     return set_up, rates
 
 
 def measure_views(folders: list[Path], setting: Scale, repeats: int, seconds: float) -> dict[str, Any]:
-    """Views a second of one and of two workers, each with a home of its own."""
+    """Views a second of one and of two workers, each with a home of its own.
+
+    The rate in processor time is that of one core that has nothing else to do.
+    """
     measured: dict[str, Any] = {}
     for workers in WORKERS:
         jobs = (joblib.delayed(view_rates)(folder, setting, repeats, seconds) for folder in folders[:workers])
         set_up, rates = zip(*joblib.Parallel(n_jobs=workers)(jobs))
-        measured[str(workers)] = spread(np.sum(rates, axis=0)) | {"set_up_s": float(np.median(set_up))}
+        wall, processor = np.moveaxis(rates, -1, 0)
+        measured[str(workers)] = spread(wall.sum(axis=0)) | {
+            "set_up_s": float(np.median(set_up)),
+            "per_processor_s": float(np.median(processor)),
+        }
     return measured
 
 
@@ -186,6 +197,7 @@ def table(measured: dict[str, Any]) -> list[str]:
     return [
         f"scale {measured['scale']}: median [smallest, largest] of the repeats",
         *lines,
+        f"{'complete views, one whole core':<34}{measured['by_workers']['1']['per_processor_s']:>10,.1f} /s",
         f"{'views, homes read and prepared':<34}{measured['generated_views_per_s']:>10,.1f} /s",
         f"{'look-up against rendering':<34}{ratio['median']:>10,.1f} x   [{ratio['low']:,.1f}, {ratio['high']:,.1f}]",
         f"{'  another texture for every pair':<34}{measured['ratio_to_fresh_rerendering']:>10,.1f} x",

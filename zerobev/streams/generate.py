@@ -116,7 +116,7 @@ def _attempt(
     except InputError as error:
         return error
     finally:
-        # scenes hold themselves in cycles: without this they pile up until the worker's memory is called a leak
+        # meshes refer to themselves: without this they pile up until joblib takes the worker's memory for a leak
         gc.collect()
 
 
