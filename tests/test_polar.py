@@ -169,7 +169,7 @@ def test_bad_bands_are_named(edges):
 
 
 def test_sinusoids_have_sine_on_even_and_cosine_on_odd_channels():
-    encoding = sinusoids(7, 16)
+    encoding = sinusoids(torch.arange(7), 16)
     for row in range(7):
         for pair in range(8):
             angle = row / 10_000 ** (2 * pair / 16)

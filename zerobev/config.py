@@ -100,6 +100,8 @@ class ModelConfig:
     heads: int = 4
     layers: int = 2  #: of the column encoder, and of the ray decoder
     dropout: float = 0.1
+    ground_start: bool = False  #: rays begin by looking at the image row where the floor is seen (not in the paper)
+    zero_gain: float = 1.0  #: factor on the first weights of the zero-shot stream's CNN
     band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
@@ -181,8 +183,10 @@ SCALES = {
                 vpn_channels=(16, 32, 64),
                 layers=1,
                 dropout=0.0,
+                ground_start=True,
+                zero_gain=12.0,
             ),
-            train=TrainConfig(steps=800, learning_rate=1.2e-3, decay_every=150, validate_every=100, warmup=30),
+            train=TrainConfig(steps=600, learning_rate=1.5e-3, decay_every=150, validate_every=100, warmup=30),
             depth=TrainConfig(steps=3000, learning_rate=2e-3, decay_every=100, validate_every=500, warmup=50, batch=32),
         ),
         Scale(

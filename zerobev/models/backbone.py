@@ -73,10 +73,11 @@ class ZeroCNN(nn.Module):
     states backbone maps at strides 4 to 32, which four such layers cannot reach; at stem stride 4 the image is
     therefore first folded, 2 x 2 pixels into 4 channels, which halves its size and loses nothing.
 
-    There is no normalisation: the scale of the input means something, and an empty image is a usual one.
+    There is no normalisation: the scale of the input means something, and an empty image is a usual one. `gain` scales
+    the first weights, and with them all maps: beside the features of a photograph those of a sparse image are faint.
     """
 
-    def __init__(self, channels: tuple[int, ...], stem_stride: int, in_channels: int = 1):
+    def __init__(self, channels: tuple[int, ...], stem_stride: int, in_channels: int = 1, gain: float = 1.0):
         super().__init__()
         self.fold = stem_stride // 2
         widths = (in_channels * self.fold**2, *channels)
@@ -84,6 +85,8 @@ class ZeroCNN(nn.Module):
         for layer in self.layers:
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
+        with torch.no_grad():
+            self.layers[0].weight.mul_(gain)
 
     def forward(self, zero: Tensor) -> list[Tensor]:
         """(N, in_channels, H, W) -> maps (N, channels[b], ceil(H / stride_b), ceil(W / stride_b)), finest first."""

@@ -13,10 +13,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+#: How much larger positions are, and weights of queries and keys, where rays start at the ground.
+_GROUND_POSITION, _GROUND_WEIGHT = 6.0, 1.5
 
-def sinusoids(length: int, width: int) -> Tensor:
-    """Positional encoding (length, width) float32: sines on even, cosines on odd channels (Vaswani et al. 2017)."""
-    position = torch.arange(length, dtype=torch.float64)[:, None]
+
+def sinusoids(positions: Tensor, width: int) -> Tensor:
+    """Positions (L,) encoded as (L, width) float32: sines on even, cosines on odd channels (Vaswani et al. 2017)."""
+    position = positions.double()[:, None]
     rate = 10_000.0 ** (-torch.arange(0, width, 2, dtype=torch.float64) / width)
     return torch.stack([(position * rate).sin(), (position * rate).cos()], dim=-1).flatten(1).float()
 
@@ -44,6 +47,13 @@ class MultiHeadAttention(nn.Module):
         self.width, self.heads = width, heads
         self.inputs = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
+
+    @torch.no_grad()
+    def start_equal(self, weight: float) -> None:
+        """Give queries and keys one weight matrix, `weight` times the identity: like positions then attract."""
+        queries, keys, _ = self.inputs.weight.chunk(3)
+        nn.init.eye_(queries).mul_(weight)
+        keys.copy_(queries)
 
     def project(self, x: Tensor, position: Tensor, first: int, last: int) -> tuple[Tensor, ...]:
         """Of (queries, keys, values) those from `first` to `last`: x (N, L, d) -> each (N, heads, L, d / heads)."""
@@ -122,18 +132,40 @@ class BandTransformer(nn.Module):
 
     A ray starts as a trained embedding of its positions, the same for every column; until it meets a column in the
     first cross-attention it is therefore computed once, not N times.
+
+    floor_rows: (positions,) the row of the column that sees the floor at each position. If it is given, training starts
+    from the projection of a flat floor: a position of the ray is encoded as that row is, queries and keys start with
+    equal weights, and so each position looks at the row where it would be if all were floor. Short trainings need
+    that: as long as the attention is diffuse, the Dice loss has its minimum at an all-white map.
     """
 
-    def __init__(self, width: int, heads: int, hidden: int, layers: int, dropout: float, rows: int, positions: int):
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        hidden: int,
+        layers: int,
+        dropout: float,
+        rows: int,
+        positions: int,
+        floor_rows: Tensor | None = None,
+    ):
         super().__init__()
         self.encoder = nn.ModuleList(EncoderLayer(width, heads, hidden, dropout) for _ in range(layers))
         self.decoder = nn.ModuleList(DecoderLayer(width, heads, hidden, dropout) for _ in range(layers))
         self.ray = nn.Parameter(torch.empty(positions, width))
-        self.register_buffer("position", sinusoids(rows, width), persistent=False)
-        self.register_buffer("ray_position", sinusoids(positions, width), persistent=False)
+        ground = floor_rows is not None
+        gain = _GROUND_POSITION if ground else 1.0
+        seen_at = floor_rows if ground else torch.arange(positions)
+        self.register_buffer("position", gain * sinusoids(torch.arange(rows), width), persistent=False)
+        self.register_buffer("ray_position", gain * sinusoids(seen_at, width), persistent=False)
         for parameter in self.parameters():
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
+        if ground:
+            nn.init.zeros_(self.ray)
+            for layer in self.decoder:
+                layer.cross_attention.start_equal(_GROUND_WEIGHT)
 
     def attend(self, columns: Tensor) -> tuple[Tensor, BandAttention]:
         """Columns (N, R, d), top row first -> rays (N, P, d), and all attention weights."""

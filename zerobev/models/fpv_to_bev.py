@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from zerobev.config import CameraConfig, ModelConfig
 from zerobev.errors import InputError
 from zerobev.models.band_transformer import BandAttention, BandTransformer
-from zerobev.models.polar import PolarToCartesian, band_rows
+from zerobev.models.polar import PolarToCartesian, band_rows, floor_row
 
 
 class FpvToBev(nn.Module):
@@ -29,7 +29,14 @@ class FpvToBev(nn.Module):
         strides = [model.stem_stride * 2**b for b in range(len(rows))][::-1]
         self.bands = nn.ModuleList(
             BandTransformer(
-                model.width, model.heads, hidden, model.layers, model.dropout, -(-camera.fpv_px // stride), len(r)
+                model.width,
+                model.heads,
+                hidden,
+                model.layers,
+                model.dropout,
+                -(-camera.fpv_px // stride),
+                len(r),
+                floor_row(camera, r, stride) if model.ground_start else None,
             )
             for r, stride, hidden in zip(rows, strides, model.ffn)
         )

@@ -42,6 +42,17 @@ def image_column(camera: CameraConfig, rows: range) -> Tensor:
     return camera.fpv_px / 2 + camera.focal_px * x / z[:, None]
 
 
+def floor_row(camera: CameraConfig, rows: range, stride: int) -> Tensor:
+    """The row of a feature map, as a real number, that sees the floor at the depth of each map row: (P,) float64.
+
+    The camera does not pitch, so that floor at depth z is seen at image row H / 2 + focal height / z in every column.
+    Floor below the image is taken for its last row.
+    """
+    z = (camera.bev_px - torch.tensor(rows, dtype=torch.float64) - 0.5) * camera.cell_m
+    v = camera.fpv_px / 2 + camera.focal_px * camera.height_m / z
+    return (v / stride - 0.5).clamp(max=-(-camera.fpv_px // stride) - 1)
+
+
 class PolarToCartesian(nn.Module):
     """Resample one band of polar rays to the cells of map rows `rows`, linearly between the centres of feature columns.
 

@@ -27,7 +27,7 @@ class TIM(BevModel):
         self.backbone = RgbEncoder(model)
         channels = model.channels
         if model.segmentation:
-            self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, len(LABELS))
+            self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, len(LABELS), model.zero_gain)
             channels = tuple(map(sum, zip(channels, model.zero_channels)))
         self.pyramid = FeaturePyramid(channels, model.width)
         self.bands = FpvToBev(camera, model)

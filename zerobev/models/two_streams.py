@@ -35,7 +35,7 @@ class TwoStreamZeroBEV(BevModel):
         if not model.aux:
             raise InputError("aux: expected at least one map for the RGB stream to predict, found none")
         self.backbone = RgbEncoder(model)
-        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride)
+        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, gain=model.zero_gain)
         self.pyramid = FeaturePyramid(model.channels, model.width)
         self.bands = FpvToBev(camera, model)
         self.outs = nn.ModuleList(nn.Linear(c, model.width) for c in reversed(model.zero_channels))  # near band first

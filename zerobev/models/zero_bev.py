@@ -30,7 +30,7 @@ class ZeroBEV(BevModel):
     def __init__(self, camera: CameraConfig, model: ModelConfig):
         super().__init__(camera, model)
         self.backbone = RgbEncoder(model)
-        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride)
+        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, gain=model.zero_gain)
         self.pyramid = FeaturePyramid(tuple(map(sum, zip(model.channels, model.zero_channels))), model.width)
         self.bands = FpvToBev(camera, model)
         if model.residual:
