@@ -7,13 +7,15 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from zerobev.config import SCALES
+from zerobev.config import SCALES, CameraConfig
 from zerobev.errors import InputError
 from zerobev.models import ZeroBEV
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandTransformer
 from zerobev.models.decoder import BevDecoder
+from zerobev.models.polar import band_rows, floor_row
 from zerobev.models.pyramid import FeaturePyramid
+from zerobev.models.variants import build
 
 SMOKE = SCALES["smoke"]
 
@@ -198,3 +200,29 @@ def test_unusable_checkpoints_are_named(tmp_path, how):
     with pytest.raises(InputError) as caught:
         ZeroBEV.load(path)
     assert str(path) in str(caught.value) and "expected" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_ground_start_looks_at_the_floor_and_a_plain_start_does_not():
+    """Before any training, each position of a ray attends to the row that sees the floor at its depth."""
+    camera = CameraConfig(fpv_px=64, bev_px=40)
+    images = torch.rand(2, 3, 64, 64), (torch.rand(2, 1, 64, 64) > 0.8).float()
+    errors = {}
+    for start in (True, False):
+        torch.manual_seed(0)
+        model = replace(SCALES["reduced"].model, ground_start=start)
+        net = build("c", camera, model).eval()
+        with torch.inference_mode():
+            far = net.attention(*images)[-1].cross[0][:, 0]  # first head, of the highest frequencies: N P R
+        expected = floor_row(camera, band_rows(camera, model.band_edges_m)[-1], model.stem_stride)
+        errors[start] = (far.argmax(-1) - expected).abs().mean()
+    assert errors[True] < 0.6 and errors[False] > 3
+
+
+def test_zero_gain_scales_every_map_of_the_zero_cnn():
+    image = torch.rand(2, 1, 32, 32)
+    maps = []
+    for gain in (1.0, 5.0):
+        torch.manual_seed(0)
+        maps.append(ZeroCNN((4, 8, 8, 8), 2, gain=gain)(image))
+    for plain, scaled in zip(*maps):
+        torch.testing.assert_close(scaled, 5 * plain)

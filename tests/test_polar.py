@@ -14,10 +14,10 @@ from zerobev.config import SCALES, CameraConfig
 from zerobev.errors import InputError
 from zerobev.models.band_transformer import sinusoids
 from zerobev.models.fpv_to_bev import reweigh
-from zerobev.models.polar import PolarToCartesian, band_rows
+from zerobev.models.polar import PolarToCartesian, band_rows, floor_row
 from zerobev.sensors.cameras import Pose
 from zerobev.sensors.gbuffer import RayCaster
-from zerobev.streams.projection import cells_of_pixels, project
+from zerobev.streams.projection import cells_of_pixels, map_points, project
 
 EDGES = (0.0, 0.8, 2.0, 3.8, 5.0)
 cameras = st.builds(
@@ -175,3 +175,23 @@ def test_sinusoids_have_sine_on_even_and_cosine_on_odd_channels():
             angle = row / 10_000 ** (2 * pair / 16)
             assert encoding[row, 2 * pair].item() == pytest.approx(math.sin(angle), abs=1e-6)
             assert encoding[row, 2 * pair + 1].item() == pytest.approx(math.cos(angle), abs=1e-6)
+
+
+@given(cameras, st.sampled_from((2, 4, 8, 16)))
+@settings(max_examples=30)
+def test_floor_rows_see_the_floor(camera, stride):
+    """A point at the depth of a map row, on the image row that is named, has no height; below the image, the last row."""
+    rows = range(camera.bev_px)
+    found = floor_row(camera, rows, stride)
+    last = -(-camera.fpv_px // stride) - 1
+    depths = [(camera.bev_px - row - 0.5) * camera.cell_m for row in rows]
+    for row, depth in zip(found, depths):
+        height = map_points(torch.full((camera.fpv_px, 1), depth).expand(-1, camera.fpv_px), camera)[:, 0, 2].double()
+        pixel = stride * (row + 0.5) - 0.5
+        assert pixel > camera.fpv_px / 2 - 0.5
+        if row < last:
+            slope = (height[-1] - height[0]) / (camera.fpv_px - 1)  # heights fall evenly from row to row
+            assert abs(height[0] + slope * pixel) < 1e-4 * max(1.0, depth)
+        else:
+            assert row == last
+    assert (found[1:] >= found[:-1]).all()
