@@ -180,7 +180,7 @@ def test_sinusoids_have_sine_on_even_and_cosine_on_odd_channels():
 @given(cameras, st.sampled_from((2, 4, 8, 16)))
 @settings(max_examples=30)
 def test_floor_rows_see_the_floor(camera, stride):
-    """A point at the depth of a map row, on the image row that is named, has no height; below the image, the last row."""
+    """A point at the depth of a map row, on the image row that is named, has no height."""
     rows = range(camera.bev_px)
     found = floor_row(camera, rows, stride)
     last = -(-camera.fpv_px // stride) - 1
