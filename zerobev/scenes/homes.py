@@ -13,7 +13,7 @@ import numpy as np
 from zerobev import config
 from zerobev.config import SceneConfig
 from zerobev.errors import run_command
-from zerobev.progress import progress
+from zerobev.parallel import run_jobs
 from zerobev.scenes.hm3dsem import Split
 from zerobev.scenes.hm3dsem_writer import write_dataset_config, write_scene
 from zerobev.scenes.indoor import generate_home
@@ -44,8 +44,7 @@ def ensure_homes(folders: list[Path], seed: int, workers: int) -> None:
     """Generate the homes of `folders` that are missing, in parallel."""
     missing = [folder for folder in folders if not folder.exists()]
     jobs = (joblib.delayed(ensure_home)(folder, seed) for folder in missing)
-    written = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
-    for _ in progress(written, "homes", "home", len(missing)):
+    for _ in run_jobs(jobs, workers, "homes", len(missing)):
         pass
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from zerobev import config
 from zerobev.config import CameraConfig, TextureConfig
 from zerobev.errors import InputError, run_command
-from zerobev.progress import progress
+from zerobev.parallel import run_jobs
 from zerobev.scenes.hm3dsem import read_scene, split_scenes
 from zerobev.storage import write_json
 from zerobev.streams.shards import Shard, checksum, recorded_with, write_shard
@@ -87,8 +87,7 @@ def generate(
             )
             for folder in folders
         )
-        outcomes = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
-        found |= zip(folders, list(progress(outcomes, what, "scene", len(folders))))  # to its end: joblib counts on it
+        found |= zip(folders, list(run_jobs(jobs, workers, what, len(folders))))  # to its end: joblib counts on it
     recorded = {
         shard_path(folder, out).name: {"seed": _scene_seed(folder, seed), "sha256": outcome}
         for folder, outcome in found.items()
