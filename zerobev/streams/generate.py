@@ -23,6 +23,7 @@ from zerobev import config
 from zerobev.config import CameraConfig, TextureConfig
 from zerobev.errors import InputError, run_command
 from zerobev.parallel import run_jobs
+from zerobev.progress import progress
 from zerobev.scenes.hm3dsem import read_scene, split_scenes
 from zerobev.storage import write_json
 from zerobev.streams.shards import Shard, checksum, recorded_with, write_shard
