@@ -1,12 +1,10 @@
 """Verdicts on claims, and quotients of rows, from records whose numbers are known by hand."""
 
-import json
-
 import numpy as np
 import pytest
 from records_for_tests import record
 
-from zerobev.claims import compare, judge, write_claims
+from zerobev.claims import compare, judge
 from zerobev.config import LABELS
 from zerobev.errors import InputError
 from zerobev.paper import CLAIMS, RATIOS, TABLES, Ordering, Ratio, Similar
@@ -102,13 +100,3 @@ def test_ratios():
     published = [round(compare(ratio, [])["paper"], 2) for ratio in RATIOS]
     assert published == [0.74, 1.36, 0.84, 1.38, 0.8, 0.85, 0.91, 0.86]
     assert compare(RATIOS[2], records)["ours"] is None
-
-
-def test_files_for_machines(tmp_path):
-    base = np.full((6, 8), 30.0)
-    records = [record("c", base), record("d", base + 5)]
-    write_claims(tmp_path, [judge(claim, records) for claim in CLAIMS], [compare(ratio, records) for ratio in RATIOS])
-    claims = {claim["id"]: claim for claim in json.loads((tmp_path / "claims.json").read_text())}
-    assert set(claims["1.5"]) == {"id", "table", "claim", "paper", "ours", "low", "high", "verdict"}
-    assert (claims["1.5"]["verdict"], claims["1.1"]["verdict"]) == ("holds", "not run")
-    assert len(json.loads((tmp_path / "ratios.json").read_text())) == len(RATIOS)

@@ -18,7 +18,8 @@ from zerobev.config import TrainConfig
 from zerobev.errors import InputError
 from zerobev.learning import train as training
 from zerobev.learning.losses import Losses, dice_loss
-from zerobev.learning.train import Schedule, dice_objective, train
+from zerobev.learning.schedule import Schedule
+from zerobev.learning.train import dice_objective, train
 
 CONFIG = TrainConfig(steps=20, learning_rate=0.01, decay_every=8, validate_every=6, warmup=3, patience=1, batch=4)
 

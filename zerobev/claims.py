@@ -6,7 +6,6 @@ scenes differ. A verdict stands on means over seeds with a 90 % bootstrap interv
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from zerobev.errors import InputError
 from zerobev.learning.metrics import Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
 from zerobev.paper import TABLES, Claim, Ordering, Ratio, Row, Similar
 from zerobev.records import Record
-from zerobev.storage import write_json
 
 _DRAWS = 1000
 _LEVEL = 0.9
@@ -70,12 +68,6 @@ def compare(ratio: Ratio, records: Sequence[Record]) -> dict[str, str | float | 
     found = _measure(rows, ratio.metric, lambda values: values[..., 0] / values[..., 1], records)
     ours, low, high = (None, None, None) if found is None else (round(value, 3) for value in found)
     return {**asdict(ratio), "paper": round(published[0] / published[1], 3), "ours": ours, "low": low, "high": high}
-
-
-def write_claims(folder: Path, verdicts: Sequence[Verdict], ratios: Sequence[dict[str, str | float | None]]) -> None:
-    """Write `claims.json` and `ratios.json`, for machines."""
-    write_json(folder / "claims.json", [asdict(verdict) for verdict in verdicts])
-    write_json(folder / "ratios.json", list(ratios))
 
 
 def _measured(claim: Ordering | Similar) -> tuple[tuple[str, ...], Measure]:

@@ -8,7 +8,8 @@ import joblib
 
 from zerobev.progress import progress
 
-# A worker that has handled large homes is replaced by a fresh one, and its jobs are done again: nothing to be told.
+# After large homes joblib takes a worker's memory for a leak and replaces it between two jobs: nothing is lost, and
+# nothing to be told. A worker that dies is another matter, an exception.
 warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
 
 

@@ -5,6 +5,7 @@ backbone are where the backbone of every learned method starts, in place of Imag
 """
 
 import json
+import shutil
 import time
 from dataclasses import asdict
 from functools import cached_property
@@ -57,7 +58,7 @@ class DepthPretraining:
     @property
     def weights(self) -> Path:
         """The file of its weights, trained now if it is not there."""
-        assert self.record["key"] == self.key
+        _ = self.record  # made now if there is none
         return self._weights
 
     @cached_property
@@ -85,8 +86,9 @@ class DepthPretraining:
         views = self._workspace.views(part)
         folder = self._workspace.cache / self.key / part
         paths = [folder / f"{shard.path.stem}.npy" for shard in views.shards]
-        if not all(path.exists() for path in paths):
-            for path, maps in zip(paths, predict_depth(self.estimator, views)):
+        for path, shard in zip(paths, views.shards):
+            if not path.exists():
+                (maps,) = predict_depth(self.estimator, ViewSet([shard]))
                 with replacing(path) as temporary, temporary.open("wb") as file:
                     np.save(file, maps)
         return views.with_depth([np.load(path, mmap_mode="r") for path in paths])
@@ -109,6 +111,7 @@ class DepthPretraining:
         device = next(network.parameters()).device.type
         errors = depth_errors(network, workspace.views("test"), device)
         network.cpu().save(self._weights)
+        shutil.rmtree(workspace.cache / self.key, ignore_errors=True)  # depth that earlier weights predicted
         (workspace.runs / self.key / "checkpoint.pt").unlink(missing_ok=True)
         return {
             "key": self.key,

@@ -6,13 +6,13 @@ from typing import Any
 
 import torch
 
-from zerobev.config import LABELS
+from zerobev.config import LABELS, Scale
 from zerobev.experiments import Experiment
 from zerobev.gallery import gallery_indices
 from zerobev.learning.evaluate import Projector, evaluate, model_projector
 from zerobev.learning.train import History, Source, train
 from zerobev.models.checkpoint import BevModel
-from zerobev.models.variants import build
+from zerobev.models.variants import VARIANTS, build
 from zerobev.models.vpn import VPN
 from zerobev.models.weights import load_backbone
 from zerobev.pretraining import DepthPretraining
@@ -59,7 +59,7 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
         config["depth"] = DepthPretraining(workspace).key
     if experiment.network is not None:
         texture = workspace.texture_identity(experiment.texture(scale))
-        config |= {"model": asdict(scale.model), "backbone": scale.backbone}
+        config |= {"model": asdict(scale.model), "backbone": _backbone(experiment, scale)}
         config |= {"train": asdict(scale.train), "texture": texture}
     return config
 
@@ -120,8 +120,7 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     scale = workspace.scale
     torch.manual_seed(seed)
     model = build(experiment.network, scale.camera, scale.model)
-    source = scale.vpn_backbone if isinstance(model, VPN) else scale.backbone
-    load_backbone(model.backbone, source or DepthPretraining(workspace).weights)
+    load_backbone(model.backbone, _backbone(experiment, scale) or DepthPretraining(workspace).weights)
     folder = workspace.runs / key
     stages = [stream(experiment, workspace, "train", depth, seed) for depth in _stages(experiment)]
     held_out = stream(experiment, workspace, "validation", _stages(experiment)[-1], seed=0)
@@ -129,6 +128,11 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     history = train(model, InTurn(stages, scale.train.steps), validation, scale.train, folder, seed, key=key)
     model.save(folder / "model.safetensors")
     return model, history
+
+
+def _backbone(experiment: Experiment, scale: Scale) -> str:
+    """Where the first weights of its RGB backbone come from; empty: the depth estimator."""
+    return scale.vpn_backbone if VARIANTS[experiment.network][0] is VPN else scale.backbone
 
 
 def _stages(experiment: Experiment) -> tuple[str, ...]:

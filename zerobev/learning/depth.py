@@ -15,7 +15,7 @@ from zerobev.config import TrainConfig
 from zerobev.learning.losses import Losses
 from zerobev.learning.train import History, train
 from zerobev.models.depth import DepthEstimator
-from zerobev.streams.tuples import ViewSet
+from zerobev.streams.tuples import ViewOrder, ViewSet
 
 Batch = Mapping[str, Tensor]
 _BATCH = 32  # photographs that are estimated together
@@ -29,7 +29,7 @@ class DepthTuples:
 
     def __init__(self, views: ViewSet, seed: int, batch: int) -> None:
         self._views, self._seed, self._batch = views, seed, batch
-        self._epoch = -1
+        self._order = ViewOrder(len(views), seed)
 
     def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
         """`rgb` (B, 3, H, W) in [0, 1] and `depth` (B, 1, H, W) metres, of a training step."""
@@ -38,11 +38,7 @@ class DepthTuples:
 
     def sample(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Pair number `index`: photograph (H, W, 3) uint8 and depth (H, W) float32, metres."""
-        epoch, position = divmod(index, len(self._views))
-        if self._epoch != epoch:
-            self._epoch = epoch
-            self._order = np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))
-        rgb, depth = _pair(self._views, int(self._order[position]))
+        rgb, depth = _pair(self._views, self._order[index])
         mirrored = np.random.default_rng([self._seed, 1, index]).random() < 0.5
         return (rgb[:, ::-1], depth[:, ::-1]) if mirrored else (rgb, depth)
 
@@ -86,14 +82,13 @@ class DepthErrors:
 def depth_errors(estimator: DepthEstimator, views: ViewSet, device: torch.device | str = "cpu") -> DepthErrors:
     """The two errors that the paper states of its estimator, on `views`."""
     absolute = relative = pixels = 0.0
-    predicted = predict_depth(estimator, views, device)
-    for i in range(len(views)):
-        shard, view = views.locate(i)
-        first = sum(len(maps) for maps in predicted[:shard])
-        valid = view.depth > 0
-        truth = view.depth[valid].astype(np.float64)
-        error = np.abs(predicted[shard][i - first][valid] - truth)
-        absolute, relative, pixels = absolute + error.sum(), relative + (error / truth).sum(), pixels + len(truth)
+    for shard in views.shards:
+        (predicted,) = predict_depth(estimator, ViewSet([shard]), device)
+        for i, maps in enumerate(predicted):
+            depth = shard.view(i).depth
+            truth = depth[depth > 0].astype(np.float64)
+            error = np.abs(maps[depth > 0] - truth)
+            absolute, relative, pixels = absolute + error.sum(), relative + (error / truth).sum(), pixels + len(truth)
     return DepthErrors(absolute / pixels, relative / pixels)
 
 

@@ -1,10 +1,8 @@
 """How full homes are, and of what: rooms, objects and classes, beside the same numbers of HM3DSem.
 
-The reference `HM3DSEM` was counted in the `.semantic.txt` files of the 181 annotated scenes of HM3DSem v0.2 (2,599
-rooms; Yadav et al., "Habitat-Matterport 3D Semantics Dataset", CVPR 2023): regions are rooms, names are mapped by
-`categories`. Kinds of rooms are not annotated there; its means by kind are of rooms that are of a kind by what stands
-in them. HM3DSem's homes are larger than generated ones: 5, 50 and 95 % of its scenes have up to 42, 92 and 242 m2 of
-navigable floor, where generated homes have 23, 41 and 57 m2.
+The reference `HM3DSEM` is of the 181 annotated scenes of HM3DSem v0.2 and their 2,599 rooms, the regions of its
+`.semantic.txt` files. HM3DSem's homes are larger than generated ones: 5, 50 and 95 % of its
+scenes have up to 42, 92 and 242 m2 of navigable floor, where generated homes have 23, 41 and 57 m2.
 """
 
 from collections import Counter

@@ -62,6 +62,22 @@ class ViewSet:
         return shard, replace(view, depth=depth)
 
 
+class ViewOrder:
+    """Which view the samples of a training take: each pass over them is in a new order, drawn from the seed."""
+
+    def __init__(self, views: int, seed: int) -> None:
+        self._views, self._seed = views, seed
+        self._epoch = -1  # whose order is at hand
+
+    def __getitem__(self, index: int) -> int:
+        """The view of sample number `index`."""
+        epoch, position = divmod(index, self._views)
+        if self._epoch != epoch:
+            self._epoch = epoch
+            self._permutation = np.random.default_rng([self._seed, 0, epoch]).permutation(self._views)
+        return int(self._permutation[position])
+
+
 class TupleStream(ABC):
     """Endless training tuples, whatever their modality.
 
@@ -74,7 +90,7 @@ class TupleStream(ABC):
         self._camera = camera
         self._seed = seed
         self._batch = batch
-        self._epoch = -1
+        self._order = ViewOrder(len(views), seed)
 
     @abstractmethod
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
@@ -87,17 +103,9 @@ class TupleStream(ABC):
 
     def sample(self, index: int) -> Sample:
         """Tuple number `index`."""
-        epoch, position = divmod(index, len(self._views))
-        scene, view = self._views.locate(int(self._order(epoch)[position]))
+        scene, view = self._views.locate(self._order[index])
         zero, target = self.pair(view, scene, np.random.default_rng([self._seed, 1, index]))
         return view_sample(view, self._camera, scene, zero, target)
-
-    def _order(self, epoch: int) -> np.ndarray:
-        """The order of the views in a pass over them; kept until another pass is asked for."""
-        if self._epoch != epoch:
-            self._epoch = epoch
-            self._permutation = np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))
-        return self._permutation
 
 
 class SynthTuples(TupleStream):
