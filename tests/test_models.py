@@ -218,6 +218,23 @@ def test_a_ground_start_looks_at_the_floor_and_a_plain_start_does_not():
     assert errors[True] < 0.6 and errors[False] > 3
 
 
+def test_residual_gain_scales_what_the_projection_adds():
+    """The map features move in proportion to the gain when the projection appears."""
+    zero, depth = torch.ones(1, 1, 32, 32), torch.full((1, 1, 32, 32), 2.0)
+    moved = []
+    for gain in (1.0, 6.0):
+        torch.manual_seed(0)
+        net = build("d", SCALES["smoke"].camera, replace(SCALES["smoke"].model, residual_gain=gain)).eval()
+        seen = []
+        net.decoder.register_forward_pre_hook(lambda module, features: seen.append(features[0]))
+        with torch.inference_mode():
+            for planes in (depth, torch.zeros_like(depth)):  # depth 0: no pixel reaches the map
+                net(torch.zeros(1, 3, 32, 32), zero, planes)
+        moved.append(seen[0] - seen[1])
+    assert moved[0].abs().max() > 0.1
+    torch.testing.assert_close(moved[1], 6 * moved[0], atol=1e-5, rtol=1e-4)
+
+
 def test_zero_gain_scales_every_map_of_the_zero_cnn():
     image = torch.rand(2, 1, 32, 32)
     maps = []

@@ -12,6 +12,7 @@ from zerobev.config import SCALES, SceneConfig, TextureConfig, TrainConfig
 from zerobev.errors import InputError
 from zerobev.experiments import EXPERIMENTS, experiment
 from zerobev.gallery import gallery
+from zerobev.learning.losses import dice_loss
 from zerobev.models import ZeroBEV
 from zerobev.models.variants import VARIANTS
 from zerobev.paper import TABLES
@@ -66,7 +67,7 @@ def test_a_record_is_read_and_not_computed_again_until_a_fresh_one_is_asked_for(
 def test_every_row_of_every_table_is_a_run_and_each_run_is_one_row():
     rows = [row for table in TABLES.values() for row in table]
     assert set(rows) <= set(EXPERIMENTS)
-    assert {row for row in EXPERIMENTS if row not in rows} == {"c.drawn", "c.once"}
+    assert {row for row in EXPERIMENTS if row not in rows} == {"c.fixed", "c.once", "c.fixed.once", "c.paper"}
     trained = [e for e in EXPERIMENTS.values() if e.network]
     assert len({replace(e, row="") for e in EXPERIMENTS.values()}) == len(EXPERIMENTS)
     assert {e.network for e in trained} == set(VARIANTS)
@@ -96,6 +97,32 @@ def test_projections_are_what_their_depth_says(workspace, row, predicted):
     assert abs(counts.intersection - intersection).max() <= (2 if predicted else 0)
     assert abs(counts.union - union).max() <= (2 if predicted else 0)
     assert counts.pixel_iou() > (0.0 if predicted else 0.1)
+
+
+def test_each_row_is_trained_on_the_auxiliary_maps_that_it_names(workspace, monkeypatch):
+    """The loss of a batch is that of the row's own auxiliary maps, wherever they stand in it."""
+    objectives = {}
+    monkeypatch.setattr(
+        runs, "train", lambda model, *arguments, objective, **named: objectives.update(pair=(model, objective))
+    )
+    for row, channels in {"c": [0, 1], "c.I": [0], "c.II": [1]}.items():
+        train_run(EXPERIMENTS[row], workspace, 0, f"aux-{row}")
+        model, objective = objectives["pair"]
+        batch = stream(EXPERIMENTS[row], workspace, "train", "gt", 0).batch(0)
+        with torch.no_grad():
+            logits = model(batch["rgb"], batch["zero"]).aux_logits
+            expected = dice_loss(logits.sigmoid(), batch["aux"][:, channels], batch["fov"])
+            assert torch.allclose(objective(model, batch).aux, expected)
+
+
+def test_the_papers_choices_are_one_row_away_from_ours(workspace):
+    ours, paper = (runs._config(EXPERIMENTS[row], workspace) for row in ("c", "c.paper"))
+    reduced = SCALES["reduced"]
+    assert EXPERIMENTS["c.paper"].texture(reduced).scales == (1.0, 1.0) != EXPERIMENTS["c"].texture(reduced).scales
+    assert EXPERIMENTS["c.paper"].train(reduced).blank == 0 < EXPERIMENTS["c"].train(reduced).blank
+    assert EXPERIMENTS["b.2"].train(reduced).blank == 0
+    assert EXPERIMENTS["c"].model(reduced).ground_start and not EXPERIMENTS["c.paper"].model(reduced).ground_start
+    assert ours["model"] == paper["model"]  # this scale's choices are the paper's already
 
 
 def test_stages_of_depth_follow_each_other(workspace):

@@ -57,11 +57,13 @@ def views(folder) -> ViewSet:
     return ViewSet([Shard(folder / f"{number}.h5", CAMERA, TEXTURE) for number in range(2)])
 
 
-def stream(name: str, views: ViewSet, bank: TextureBank, seed: int = 1, batch: int = 6) -> TupleStream:
+def stream(
+    name: str, views: ViewSet, bank: TextureBank, seed: int = 1, batch: int = 6, blank: float = 0.0
+) -> TupleStream:
     if name in ("synth", "paper"):
-        return SynthTuples(views, bank, CAMERA, seed, batch, fresh=name == "synth")
+        return SynthTuples(views, bank, CAMERA, seed, batch, blank, fresh=name == "synth")
     kind = {"modsem": ModSemTuples, "depth": DepthProjTuples, "semantic": SemanticTuples}[name]
-    return kind(views, CAMERA, seed, batch)
+    return kind(views, CAMERA, seed, batch, blank)
 
 
 def views_of_samples(views: ViewSet, samples: list[dict]) -> list[View]:
@@ -183,6 +185,18 @@ def test_in_the_papers_mode_a_scene_wears_one_texture(views, bank):
     for sample, view in zip(samples, views_of_samples(views, samples)):
         zeros[view.rgb.tobytes()].append(sample["zero"])
     assert all(not np.array_equal(*pair) for pair in zeros.values())
+
+
+@pytest.mark.parametrize("name", ["synth", "modsem", "depth"])
+def test_the_asked_share_of_samples_is_blank_on_both_sides(views, bank, name):
+    """Blank samples are empty in the image and on the map; all others are those of a stream without blanks."""
+    plain, blanked = stream(name, views, bank), stream(name, views, bank, blank=0.3)
+    pairs = [(plain.sample(i), blanked.sample(i)) for i in range(200)]
+    blank = [not (new["zero"].any() or new["target"].any()) and old["zero"].any() for old, new in pairs]
+    assert 0.2 < np.mean(blank) < 0.4
+    unchanged = [name for name in pairs[0][0] if name not in ("zero", "target")]
+    for (old, new), is_blank in zip(pairs, blank):
+        assert all(np.array_equal(old[name], new[name]) for name in (unchanged if is_blank else old))
 
 
 def test_modsem_shows_one_of_the_draws_at_random(views, bank):

@@ -66,7 +66,8 @@ class TextureConfig:
     kernel_px: tuple[int, int] = (10, 30)  #: smallest and largest kernel of opening and dilation
     tile_px: int = 1024  #: side of a tile of the texture bank
     tiles: int = 32  #: number of tiles in the bank
-    #: structures are this many times smaller, drawn log-uniformly for each sample; equal ends are a fixed scale
+    #: structures are this many times smaller (below 1: larger), drawn log-uniformly for each sample; equal ends are a
+    #: fixed scale, and 1 is the paper's
     scales: tuple[float, float] = (1.0, 1.0)
     modsem_share: float = 0.30  #: of white texels in *Mod. Sem.* textures
 
@@ -102,6 +103,7 @@ class ModelConfig:
     dropout: float = 0.1
     ground_start: bool = False  #: rays begin by looking at the image row where the floor is seen (not in the paper)
     zero_gain: float = 1.0  #: factor on the first weights of the zero-shot stream's CNN
+    residual_gain: float = 1.0  #: factor on the first weights of the residual's embedding
     band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
@@ -122,6 +124,7 @@ class TrainConfig:
     batch: int = 16
     alpha: float = 0.5  #: weight of the auxiliary loss
     weight_decay: float = 0.0
+    blank: float = 0.0  #: share of the samples whose zero-shot image, and its map, are made empty (not in the paper)
 
 
 @dataclass(frozen=True)
@@ -181,13 +184,24 @@ SCALES = {
                 decoder_channels=(32, 48, 64),
                 vpn_depths=(1, 2, 2),
                 vpn_channels=(16, 32, 64),
+                heads=2,
                 layers=1,
                 dropout=0.0,
                 ground_start=True,
-                zero_gain=12.0,
+                zero_gain=4.0,
+                residual_gain=6.0,
             ),
-            train=TrainConfig(steps=600, learning_rate=1.5e-3, decay_every=150, validate_every=100, warmup=30),
-            depth=TrainConfig(steps=3000, learning_rate=2e-3, decay_every=100, validate_every=500, warmup=50, batch=32),
+            train=TrainConfig(
+                steps=600,
+                learning_rate=2e-3,
+                decay_every=25,
+                decay=0.85,
+                validate_every=100,
+                warmup=30,
+                blank=0.2,
+            ),
+            depth=TrainConfig(steps=8000, learning_rate=4e-3, decay_every=220, validate_every=1000, warmup=50),
+            texture=TextureConfig(scales=(0.25, 1.0)),
         ),
         Scale(
             name="paper",

@@ -10,7 +10,7 @@ from zerobev.config import LABELS, Scale
 from zerobev.experiments import Experiment
 from zerobev.gallery import gallery_indices
 from zerobev.learning.evaluate import Projector, evaluate, model_projector
-from zerobev.learning.train import History, Source, train
+from zerobev.learning.train import History, Source, dice_objective, train
 from zerobev.models.checkpoint import BevModel
 from zerobev.models.variants import VARIANTS, build
 from zerobev.models.vpn import VPN
@@ -31,7 +31,7 @@ from zerobev.streams.tuples import (
 from zerobev.workspace import Workspace, fingerprint
 
 #: Raised by hand whenever training or evaluation change what they compute: older records are then left aside.
-RECIPE_VERSION = 2
+RECIPE_VERSION = 3
 
 VALIDATION_BATCHES = 4
 _EVALUATION_BATCH = 16
@@ -59,8 +59,8 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
         config["depth"] = DepthPretraining(workspace).key
     if experiment.network is not None:
         texture = workspace.texture_identity(experiment.texture(scale))
-        config |= {"model": asdict(scale.model), "backbone": _backbone(experiment, scale)}
-        config |= {"train": asdict(scale.train), "texture": texture}
+        config |= {"model": asdict(experiment.model(scale)), "backbone": _backbone(experiment, scale)}
+        config |= {"train": asdict(experiment.train(scale)), "texture": texture}
     return config
 
 
@@ -117,15 +117,18 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     Its RGB backbone starts from the scale's pretrained weights, all else from the seed. Validation is on the stream
     that it is trained on, with the depth of the last stage, and with one fixed seed, so that scores of runs compare.
     """
-    scale = workspace.scale
+    scale, config = workspace.scale, experiment.train(workspace.scale)
     torch.manual_seed(seed)
-    model = build(experiment.network, scale.camera, scale.model)
+    model = build(experiment.network, scale.camera, experiment.model(scale))
     load_backbone(model.backbone, _backbone(experiment, scale) or DepthPretraining(workspace).weights)
     folder = workspace.runs / key
     stages = [stream(experiment, workspace, "train", depth, seed) for depth in _stages(experiment)]
     held_out = stream(experiment, workspace, "validation", _stages(experiment)[-1], seed=0)
     validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]
-    history = train(model, InTurn(stages, scale.train.steps), validation, scale.train, folder, seed, key=key)
+    objective = dice_objective(config.alpha, model.config.aux)
+    history = train(
+        model, InTurn(stages, config.steps), validation, config, folder, seed, key=key, objective=objective
+    )
     model.save(folder / "model.safetensors")
     return model, history
 
@@ -142,7 +145,8 @@ def _stages(experiment: Experiment) -> tuple[str, ...]:
 def stream(experiment: Experiment, workspace: Workspace, part: str, depth: str, seed: int) -> Source:
     """The tuples of a split that an experiment trains on; depth: "gt" or "predicted"."""
     views: ViewSet = DepthPretraining(workspace).views(part) if depth == "predicted" else workspace.views(part)
-    common = (workspace.scale.camera, seed, workspace.scale.train.batch)
+    config = experiment.train(workspace.scale)
+    common = (workspace.scale.camera, seed, config.batch, config.blank)
     if experiment.stream == "synth":
         return SynthTuples(views, workspace.bank(experiment.texture(workspace.scale)), *common, experiment.fresh)
     return {"modsem": ModSemTuples, "depthproj": DepthProjTuples, "classes": SemanticTuples}[experiment.stream](

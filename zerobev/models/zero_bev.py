@@ -35,6 +35,8 @@ class ZeroBEV(BevModel):
         self.bands = FpvToBev(camera, model)
         if model.residual:
             self.embedding = nn.Conv2d(1, model.width, 1)
+            with torch.no_grad():
+                self.embedding.weight.mul_(model.residual_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
     def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> Projection:

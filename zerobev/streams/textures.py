@@ -224,7 +224,7 @@ class TextureDraw:
     offset: np.ndarray  #: (C, 2) int32, rows and columns added to a texel's coordinates
     transpose: np.ndarray  #: (C,) bool: swap the tile's axes, before the flips
     flip: np.ndarray  #: (C, 2) bool: reverse the tile's rows, columns
-    scale: float  #: >= 1: structures are that many times smaller
+    scale: float  #: structures are that many times smaller; below 1 they are larger
 
 
 @dataclass(frozen=True)
@@ -268,8 +268,8 @@ class TextureBank:
         measures.
         """
         low, high = self.config.scales
-        if not 1 <= low <= high:
-            raise InputError(f"texture scales: expected 1 <= low <= high, found {low} and {high}")
+        if not 0 < low <= high:
+            raise InputError(f"texture scales: expected 0 < low <= high, found {low} and {high}")
         count, side, _ = self.tiles.shape
         return TextureDraw(
             tile=rng.integers(count, size=charts),

@@ -83,13 +83,17 @@ class TupleStream(ABC):
 
     Sample i is a function of (seed, i) alone: training may stop at any step and go on, or be spread over
     processes, and sees the same data. Each pass over the views is in a new random order.
+
+    blank: share of the samples whose modality is made empty, in the image and on the map. Textures fill every view; the
+    mask of a class is empty in most, and what a network paints on the map of an empty image is all error.
     """
 
-    def __init__(self, views: ViewSet, camera: CameraConfig, seed: int, batch: int) -> None:
+    def __init__(self, views: ViewSet, camera: CameraConfig, seed: int, batch: int, blank: float = 0.0) -> None:
         self._views = views
         self._camera = camera
         self._seed = seed
         self._batch = batch
+        self._blank = blank
         self._order = ViewOrder(len(views), seed)
 
     @abstractmethod
@@ -104,7 +108,10 @@ class TupleStream(ABC):
     def sample(self, index: int) -> Sample:
         """Tuple number `index`."""
         scene, view = self._views.locate(self._order[index])
-        zero, target = self.pair(view, scene, np.random.default_rng([self._seed, 1, index]))
+        rng = np.random.default_rng([self._seed, 1, index])
+        zero, target = self.pair(view, scene, rng)
+        if rng.random() < self._blank:
+            zero, target = np.zeros_like(zero), np.zeros_like(target)
         return view_sample(view, self._camera, scene, zero, target)
 
 
@@ -116,9 +123,16 @@ class SynthTuples(TupleStream):
     """
 
     def __init__(
-        self, views: ViewSet, bank: TextureBank, camera: CameraConfig, seed: int, batch: int, fresh: bool = True
+        self,
+        views: ViewSet,
+        bank: TextureBank,
+        camera: CameraConfig,
+        seed: int,
+        batch: int,
+        blank: float = 0.0,
+        fresh: bool = True,
     ) -> None:
-        super().__init__(views, camera, seed, batch)
+        super().__init__(views, camera, seed, batch, blank)
         self._bank = bank
         self._fresh = fresh
 
