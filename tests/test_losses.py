@@ -21,6 +21,7 @@ BINARY = st.integers(0, 1).map(float)
 class Maps:
     zero_logits: Tensor
     aux_logits: Tensor | None
+    pooled: Tensor | None = None
 
 
 def test_dice_by_hand():
@@ -92,6 +93,12 @@ def test_streams_are_weighed_by_alpha():
     alone = zero_bev_loss(Maps(zero, None), batch, alpha=0.25)
     assert alone.total == alone.main == zero_dice
     assert alone.aux is None
+    # maps before the U-Net join the total with the weight of the maps behind it, and not the score
+    pooled = torch.rand(2, 1, 4, 4, generator=generator)
+    shown = zero_bev_loss(Maps(zero, aux, pooled), batch, alpha=0.25)
+    expected = losses.total + 0.75 * dice_loss(pooled, batch["target"], batch["fov"])
+    torch.testing.assert_close(shown.total, expected)
+    assert shown.main == zero_dice
 
 
 def test_a_model_of_one_auxiliary_map_is_held_against_its_own():

@@ -4,9 +4,12 @@ import json
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -16,13 +19,14 @@ from zerobev.learning.losses import dice_loss, zero_bev_loss
 from zerobev.models import VARIANTS, BevModel, ZeroBEV, build, load_model
 from zerobev.models.__main__ import main, parameters
 from zerobev.models.fpv_to_bev import reweigh
+from zerobev.models.max_pooling import noisy_or
 from zerobev.models.polar import band_rows
 from zerobev.paper import PARAMETERS_M
 from zerobev.streams.projection import map_points, project
 
 SMOKE = SCALES["smoke"]
 ROWS = list(VARIANTS)
-ZERO_SHOT = ["-", "c", "d", "e"]
+ZERO_SHOT = ["-", "c", "d", "e", "f", "f.r"]
 CLASSES = len(LABELS)
 
 
@@ -113,7 +117,7 @@ def test_command_prints_every_block_and_writes_every_total(tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", ["b.1", "b.3", "d", "e"])
+@pytest.mark.parametrize("row", ["b.1", "b.3", "d", "e", "f.r"])
 def test_one_sample_passes_forward_and_backward_at_paper_scale(row):
     paper = SCALES["paper"]
     net = build(row, paper.camera, paper.model)
@@ -138,7 +142,7 @@ def test_shapes_and_gradients_reach_every_parameter(row):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "d", "e"])
+@pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "d", "e", "f.r"])
 def test_a_batch_of_one_equals_a_batch_of_many(row):
     net, images = network(row), inputs(3)
     together = net(*images)
@@ -149,7 +153,7 @@ def test_a_batch_of_one_equals_a_batch_of_many(row):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("row", ["b.1", "b.3", "d", "e"])
+@pytest.mark.parametrize("row", ["b.1", "b.3", "d", "e", "f.r"])
 @pytest.mark.parametrize(("fpv", "bev", "stem"), [(97, 25, 4), (50, 33, 2)])
 def test_any_grid(row, fpv, bev, stem):
     camera = CameraConfig(fpv_px=fpv, bev_px=bev, hfov_deg=62, bev_extent_m=4.0)
@@ -158,7 +162,7 @@ def test_any_grid(row, fpv, bev, stem):
     assert out.zero_logits.shape == (2, 8, bev, bev) and out.zero_logits.isfinite().all()
 
 
-@pytest.mark.parametrize("row", ["b.1", "c", "e"])
+@pytest.mark.parametrize("row", ["b.1", "c", "e", "f"])
 def test_a_batch_of_one_can_be_trained_on(row):
     net = network(row).train()
     net(*inputs(1)).zero_logits.sum().backward()
@@ -171,7 +175,7 @@ def test_who_reads_what():
     rgb, zero, depth = inputs(2)
     for row, reads_zero, reads_depth in (
         *(("b.1", False, False), ("b.2", False, False), ("b.3", True, False)),
-        *(("c", True, False), ("d", True, True), ("e", True, False)),
+        *(("c", True, False), ("d", True, True), ("e", True, False), ("f", True, False), ("f.r", True, True)),
     ):
         net = network(row)
         seen = net(rgb, zero, depth).zero_logits
@@ -209,7 +213,7 @@ def test_wrong_configurations_are_named():
     with pytest.raises(InputError, match="band_edges_m: expected 5 depths"):
         network("c", band_edges_m=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
     with pytest.raises(InputError, match="row: expected one of"):
-        network("f")
+        network("z")
 
 
 # --- several modalities
@@ -292,6 +296,54 @@ def test_cross_attention_of_any_column_and_position(row):
         assert torch.allclose(weights.sum(-1), torch.ones(()), atol=1e-5)
 
 
+# --- max-pooling attention
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_noisy_or_max_pools_what_open_gates_show(seed):
+    """For gates that are open or closed and binary values: the maximum of the values behind open gates."""
+    rng = np.random.default_rng(seed)
+    open_, values = rng.random((3, 5, 7)) < 0.3, rng.random((3, 7, 4)) < 0.5
+    logits = torch.from_numpy(np.where(open_, 40.0, -40.0)).float()
+    expected = (open_[..., None] & values[:, None]).any(axis=2)
+    found = noisy_or(logits, torch.from_numpy(values).float())
+    torch.testing.assert_close(found, torch.from_numpy(expected).float(), atol=1e-6, rtol=0)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_noisy_or_lies_between_the_largest_term_and_the_sum_and_is_monotone(seed):
+    torch.manual_seed(seed)
+    logits, values = 3 * torch.randn(2, 5, 7), torch.rand(2, 7, 4)
+    terms = logits.sigmoid()[..., None] * values[:, None]  # 2 5 7 4
+    found = noisy_or(logits, values)
+    torch.testing.assert_close(found, 1 - (1 - terms).prod(2), atol=1e-5, rtol=1e-5)
+    assert (found >= terms.amax(2) - 1e-5).all() and (found <= terms.sum(2) + 1e-5).all()
+    raised = values.clone()
+    raised[:, 3] += (1 - raised[:, 3]) / 2
+    assert (noisy_or(logits, raised) >= found - 1e-6).all()
+    order = torch.randperm(4)
+    torch.testing.assert_close(noisy_or(logits, values[..., order]), found[..., order])
+    # the shortcut for binary values is the same function
+    binary = (values > 0.5).float()
+    torch.testing.assert_close(noisy_or(logits, binary), noisy_or(logits, binary * (1 - 1e-7)), atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_with_one_gate_a_pixel_the_pooled_map_is_the_projection():
+    """Gates that are open where each pixel's depth puts it: P^-1 on the rays, cell by cell where columns are exact."""
+    batch = views(4, SMOKE.camera)
+    net, camera = network("f"), SMOKE.camera
+    row = camera.bev_px - 1 - (batch["depth"][:, 0] / camera.cell_m).floor().long()  # B H W
+    reached = row.permute(0, 2, 1)[:, :, None] == torch.arange(camera.bev_px)[:, None]  # B W P H
+    pooled = noisy_or(torch.where(reached, 40.0, -40.0), batch["zero"].permute(0, 3, 2, 1))
+    on_map = net.resample_pixels(pooled)[0][..., 0]
+    projected = project(batch["zero"], batch["depth"], camera)[:, 0]
+    inside = (batch["fov"][:, 0] > 0) & net.resample_pixels.valid
+    assert ((on_map > 0.5) == (projected > 0.5))[inside].float().mean() > 0.9
+
+
 # --- checkpoints
 
 
@@ -325,7 +377,7 @@ def test_checkpoints_of_other_classes_are_named(tmp_path):
 # --- learning
 
 
-@pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "c", "d", "e"])
+@pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "c", "d", "e", "f"])
 def test_eight_views_are_learnt_by_heart(row):
     """Far below the loss of ones everywhere, the best that knows nothing of the view."""
     batch = views(8, SMOKE.camera)

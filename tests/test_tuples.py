@@ -235,6 +235,17 @@ def test_semantic_tuples_are_the_samples_of_the_evaluation(views, bank):
     assert same(batch, {name: tensor[order] for name, tensor in evaluated.items()})
 
 
+def test_the_first_views_of_each_scene_are_the_same_views(views):
+    """Of shards with 5 and 3 views the first 4 are views 0-3 and 5-7, with the depth that was given to them."""
+    maps = [np.full((count, 24, 24), 1.0 + i, np.float32) for i, count in enumerate(COUNTS)]
+    for some in (views.with_depth(maps).first(4), views.first(4).with_depth(maps)):
+        assert len(some) == 7 and len(some.first(None)) == 7
+        for place, whole in enumerate([0, 1, 2, 3, 5, 6, 7]):
+            (scene, view), (same_scene, given) = some.locate(place), views.locate(whole)
+            assert scene == same_scene and np.array_equal(view.rgb, given.rgb)
+            assert (view.depth == 1 + scene).all()
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_depth_may_be_replaced(views, bank, dtype):
     rng = np.random.default_rng(0)

@@ -138,6 +138,7 @@ class Scale:
     train: TrainConfig
     depth: TrainConfig  #: of the depth estimator
     texture: TextureConfig = field(default_factory=TextureConfig)
+    test_views: int | None = None  #: of each test scene, the first ones, that networks are evaluated on; None: all
     #: first weights of the RGB backbones, as `models.weights.load_backbone` takes them; empty: the depth estimator's
     backbone: str = ""
     vpn_backbone: str = ""
@@ -202,6 +203,7 @@ SCALES = {
             ),
             depth=TrainConfig(steps=8000, learning_rate=4e-3, decay_every=220, validate_every=1000, warmup=50),
             texture=TextureConfig(scales=(0.25, 1.0)),
+            test_views=40,
         ),
         Scale(
             name="paper",

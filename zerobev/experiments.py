@@ -57,6 +57,8 @@ def _experiments() -> dict[str, Experiment]:
         Experiment("c.II", "c.II"),
         Experiment("d.I", "d.I", train_depth=stages),
         Experiment("e", "e"),
+        Experiment("f", "f"),
+        Experiment("f.r", "f.r", train_depth=stages),
         # Table 3
         Experiment("d.gt", "d"),
         Experiment("d.predicted", "d", train_depth=("predicted",)),

@@ -55,6 +55,7 @@ def run_key(experiment: Experiment, workspace: Workspace, seed: int) -> str:
 def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
     scale = workspace.scale
     config = {"experiment": asdict(experiment), "data": workspace.identity, "recipe": RECIPE_VERSION}
+    config["test_views"] = scale.test_views
     if experiment.network is not None or experiment.test_depth == "predicted":
         config["depth"] = DepthPretraining(workspace).key
     if experiment.network is not None:
@@ -80,7 +81,7 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     predicted = experiment.reads_depth and experiment.test_depth == "predicted"
     test = pretraining.views("test") if predicted else workspace.views("test")
     trained = time.monotonic()
-    batches = semantic_batches(test, workspace.scale.camera, _EVALUATION_BATCH)
+    batches = semantic_batches(test.first(workspace.scale.test_views), workspace.scale.camera, _EVALUATION_BATCH)
     counts = evaluate(projector, batches, len(test.shards), len(LABELS))
     record = Record(
         key=key,

@@ -17,6 +17,7 @@ class Projection(Protocol):
 
     zero_logits: Tensor  #: (B, K, M, M)
     aux_logits: Tensor | None  #: (B, A, M, M)
+    pooled: Tensor | None  #: (B, K, M, M) in [0, 1]
 
 
 class Losses(NamedTuple):
@@ -57,17 +58,21 @@ def zero_bev_loss(
 ) -> Losses:
     """Dice loss of the main maps, and of the auxiliary maps with weight `alpha` where the model has them.
 
+    Where the model shows its maps before the U-Net, their loss is added to the total, with the weight of the main maps:
+    it reaches the geometry without a detour.
+
     projection: logits (B, K, M, M) and, or None, (B, A, M, M), before the FOV mask
     batch: `target` (B, K, M, M), `aux` (B, 2, M, M) in the order of `AUX` if the model predicts it, `fov` (B, 1, M, M)
     alpha: weight of the auxiliary loss, in [0, 1]; without auxiliary maps the main loss stands alone
     aux: names of the A maps that the model predicts, its `config.aux`
     """
     zero = dice_loss(projection.zero_logits.float().sigmoid(), batch["target"], batch["fov"])
+    minimised = zero if projection.pooled is None else zero + dice_loss(projection.pooled, batch["target"], batch["fov"])
     if projection.aux_logits is None:
-        return Losses(zero, zero)
+        return Losses(minimised, zero)
     true_aux = batch["aux"][:, [AUX.index(name) for name in aux]]
     aux_loss = dice_loss(projection.aux_logits.float().sigmoid(), true_aux, batch["fov"])
-    return Losses((1 - alpha) * zero + alpha * aux_loss, zero, aux_loss)
+    return Losses((1 - alpha) * minimised + alpha * aux_loss, zero, aux_loss)
 
 
 def _over_processes(sums: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ class Projection(NamedTuple):
 
     zero_logits: Tensor  #: (B, K, M, M): one map a zero-shot image, or one a class
     aux_logits: Tensor | None  #: (B, len(aux), M, M), or None where the network has no auxiliary output
+    pooled: Tensor | None = None  #: (B, K, M, M) in [0, 1]: the maps before the U-Net, of a network that has them
 
 
 class BevModel(nn.Module):

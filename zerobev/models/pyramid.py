@@ -5,12 +5,15 @@ from torch import Tensor, nn
 
 
 class FeaturePyramid(nn.Module):
-    """1x1 laterals, top-down nearest upsampling, 3x3 outputs; all maps get `width` channels, sizes stay."""
+    """1x1 laterals, top-down nearest upsampling, 3x3 outputs; all maps get `width` channels, sizes stay.
 
-    def __init__(self, channels: tuple[int, ...], width: int):
+    outputs: how many maps come out, the finest ones; None: all
+    """
+
+    def __init__(self, channels: tuple[int, ...], width: int, outputs: int | None = None):
         super().__init__()
         self.laterals = nn.ModuleList(nn.Conv2d(c, width, 1) for c in channels)
-        self.outputs = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in channels)
+        self.outputs = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in channels[:outputs])
         for layer in (*self.laterals, *self.outputs):
             nn.init.kaiming_uniform_(layer.weight, a=1)
             nn.init.zeros_(layer.bias)
@@ -23,4 +26,4 @@ class FeaturePyramid(nn.Module):
             # Doubled and cropped, not stretched: at odd sizes too, coarse pixel i stays over fine pixels 2i and 2i + 1.
             doubled = F.interpolate(merged[fine + 1], scale_factor=2, mode="nearest")
             merged[fine] = merged[fine] + doubled[..., :rows, :columns]
-        return [output(features) for output, features in zip(self.outputs, merged)]
+        return [output(features) for output, features in zip(self.outputs, merged)]  # of the finest ones

@@ -1,4 +1,4 @@
-"""Every network of the paper's Tables 1 and 2 by the letter of its row, and every network by its checkpoint."""
+"""Every network by the letter of its row in the paper's Tables 1 and 2 or, past the paper, (f); and by its checkpoint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +8,7 @@ from zerobev.config import CameraConfig, ModelConfig
 from zerobev.errors import InputError
 from zerobev.models.checkpoint import BevModel, description
 from zerobev.models.depth import DepthNet
+from zerobev.models.max_pooling import MaxPoolZeroBEV
 from zerobev.models.tim import TIM
 from zerobev.models.two_streams import TwoStreamZeroBEV
 from zerobev.models.vpn import VPN
@@ -25,6 +26,8 @@ VARIANTS: dict[str, tuple[type[BevModel], dict[str, Any]]] = {
     "d": (ZeroBEV, {"residual": True}),
     "d.I": (ZeroBEV, {"aux": (), "residual": True}),
     "e": (TwoStreamZeroBEV, {}),
+    "f": (MaxPoolZeroBEV, {}),
+    "f.r": (MaxPoolZeroBEV, {"residual": True}),
 }
 
 

@@ -25,15 +25,22 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 class ViewSet:
-    """The views of several shards under one index."""
+    """The views of several shards under one index; of each shard the first `most`, or all."""
 
-    def __init__(self, shards: list[Shard]) -> None:
+    def __init__(self, shards: list[Shard], most: int | None = None) -> None:
         self.shards = shards
-        self._start = np.cumsum([0, *(len(shard) for shard in shards)])
+        self._most = most
+        self._start = np.cumsum([0, *(len(shard) if most is None else min(len(shard), most) for shard in shards)])
         self._depth: Sequence[np.ndarray] | None = None
 
     def __len__(self) -> int:
         return int(self._start[-1])
+
+    def first(self, most: int | None) -> "ViewSet":
+        """Of each shard the first `most` of these views, or all."""
+        some = ViewSet(self.shards, self._most if most is None else most)
+        some._depth = self._depth
+        return some
 
     def with_depth(self, maps: Sequence[np.ndarray]) -> "ViewSet":
         """The same views with their depth replaced, by a predicted one say.
@@ -45,7 +52,7 @@ class ViewSet:
         found = [len(shard_maps) for shard_maps in maps]
         if found != expected:
             raise InputError(f"depth maps: expected {expected} views a shard, found {found}")
-        changed = ViewSet(self.shards)
+        changed = ViewSet(self.shards, self._most)
         changed._depth = maps
         return changed
 

@@ -1,0 +1,121 @@
+"""Zero-BEV with an attention that max-pools: variant (f), which is not in the paper.
+
+photograph -> backbone -> pyramid -> gates: does this pixel show at that position of its ray?
+                            :          :
+                            :          :--- noisy OR with the zero-shot image, as it is --> pooled map -> embedding --.
+                            '----------'--- mean, weighted with the gates ---------------> map features ------------ + -> U-Net
+
+The paper's supplement calls max-pooling along the vertical the open point of its Theorem 3.1: attention averages, and an
+average of binary values is no maximum. Gates that each say yes or no, and an OR over them, are one.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from zerobev.config import CameraConfig, ModelConfig
+from zerobev.models.backbone import RgbEncoder
+from zerobev.models.checkpoint import IMAGES_A_PASS, BevModel, Projection
+from zerobev.models.decoder import BevDecoder
+from zerobev.models.polar import PolarToCartesian, floor_row
+from zerobev.models.pyramid import FeaturePyramid
+from zerobev.streams.projection import project
+
+#: Before training a gate falls by 1 (as a logit) over this share of the image's height, away from the row of the floor.
+_FLOOR_WIDTH = 1 / 32
+#: No gate starts lower than this (as a logit): it could not open any more.
+_LOWEST = -4.0
+
+
+def noisy_or(logits: Tensor, values: Tensor) -> Tensor:
+    """1 - prod_y (1 - g h_y) for gates g = sigmoid(logits) and values h in [0, 1].
+
+    The maximum over the pixels whose gate is open where gates are 0 or 1 and values binary; in between, at least every
+    single g h_y and at most their sum; monotone in every value, and modality by modality.
+
+    logits: (..., P, R) of P positions over R pixels
+    values: (..., R, K) of K modalities
+    Returns (..., P, K) in [0, 1].
+    """
+    if bool(((values == 0) | (values == 1)).all()):
+        # log (1 - g h) = h log (1 - g): one matrix product serves all modalities
+        closed = -F.softplus(logits) @ values.to(logits.dtype)
+    else:
+        gates = logits.sigmoid().float().clamp(max=1 - 1e-6)
+        closed = torch.stack([torch.log1p(-gates * h[..., None, :]).sum(-1) for h in values.unbind(-1)], dim=-1)
+    return -torch.expm1(closed.float())
+
+
+class Gates(nn.Module):
+    """For each pixel of the photograph and each position of its column's ray, whether the one shows on the other.
+
+    A logit is the sum of what the pixel's features tell and of what its row does. The latter starts at the projection of
+    a flat floor.
+    """
+
+    def __init__(self, camera: CameraConfig, width: int, stride: int):
+        super().__init__()
+        self.side, self.stride = camera.fpv_px, stride
+        self.head = nn.Conv2d(width, camera.bev_px * stride**2, 1)  # for each pixel under a feature
+        nn.init.normal_(self.head.weight, std=0.3 * width**-0.5)
+        nn.init.zeros_(self.head.bias)
+        away = torch.arange(camera.fpv_px) - floor_row(camera, range(camera.bev_px), 1)[:, None]
+        self.prior = nn.Parameter((-away.abs() / (_FLOOR_WIDTH * camera.fpv_px)).clamp(min=_LOWEST).float())  # P H
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Finest features (B, width, R, C) -> logits (B, W, P, H); position p is map row p, top row first."""
+        fine = F.pixel_shuffle(self.head(features), self.stride)[..., : self.side, : self.side]  # B P H W
+        return fine.permute(0, 3, 1, 2) + self.prior
+
+
+class MaxPoolZeroBEV(BevModel):
+    """Geometry from the photograph alone, values that no network touches before they are on the map.
+
+    Each pixel of the zero-shot image keeps its own gates, so that the pooled map is as fine as the image allows; the
+    U-Net, which sees the photograph's features on the map too, then completes what is hidden. Gates do not depend on the
+    zero-shot images and are computed once for all of them.
+    """
+
+    def __init__(self, camera: CameraConfig, model: ModelConfig):
+        super().__init__(camera, model)
+        rows, stride = range(camera.bev_px), model.stem_stride
+        self.backbone = RgbEncoder(model)
+        self.pyramid = FeaturePyramid(model.channels, model.width, outputs=1)
+        self.gates = Gates(camera, model.width, stride)
+        self.resample_pixels = PolarToCartesian(camera, rows, 1)
+        self.resample_features = PolarToCartesian(camera, rows, stride)
+        self.values = nn.Conv2d(model.width, model.width, 1)
+        self.embedding = nn.Conv2d(2 if model.residual else 1, model.width, 1)
+        with torch.no_grad():
+            self.embedding.weight.mul_(model.residual_gain)
+        self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
+
+    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> Projection:
+        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `Projection`.
+
+        depth: (B, 1, H, W) metres, true or estimated; the residual variant alone reads it
+        """
+        if self.config.residual:
+            self.check(rgb=(rgb, 3), zero=(zero, None), depth=(depth, 1))
+        else:
+            self.check(rgb=(rgb, 3), zero=(zero, None))
+        (features,) = self.pyramid(self.backbone(rgb))
+        gates = self.gates(features)
+        pooled = noisy_or(gates, zero.permute(0, 3, 2, 1))  # B W P K
+        pooled = self.resample_pixels(pooled)[0].permute(0, 3, 1, 2)  # B K M M
+        seen = [pooled, project(zero, depth, self.camera)] if self.config.residual else [pooled]
+        known = self.map_features(features, gates)[:, None] + self.embedding(
+            torch.stack(seen, dim=2).flatten(0, 1)
+        ).unflatten(0, zero.shape[:2])
+        logits = torch.cat([self.decoder(part) for part in known.flatten(0, 1).split(max(len(zero), IMAGES_A_PASS))])
+        logits = logits.unflatten(0, zero.shape[:2])
+        return Projection(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None, pooled)
+
+    def map_features(self, features: Tensor, gates: Tensor) -> Tensor:
+        """The photograph's features (B, d, R, C) on the map, (B, d, M, M): their mean, weighted with the gates."""
+        stride, (rows, columns) = self.config.stem_stride, features.shape[-2:]
+        open_ = gates[:, ::stride].sigmoid()  # B C P H
+        open_ = F.pad(open_, (0, rows * stride - open_.shape[-1])).unflatten(-1, (rows, stride)).mean(-1)
+        weights = open_ / (open_.sum(-1, keepdim=True) + 0.01)
+        values = self.values(features).permute(0, 3, 2, 1)  # B C R d
+        return self.resample_features(weights.to(values.dtype) @ values)[0].permute(0, 3, 1, 2)
