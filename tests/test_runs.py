@@ -119,8 +119,7 @@ def test_the_papers_choices_are_one_row_away_from_ours(workspace):
     ours, paper = (runs._config(EXPERIMENTS[row], workspace) for row in ("c", "c.paper"))
     reduced = SCALES["reduced"]
     assert EXPERIMENTS["c.paper"].texture(reduced).scales == (1.0, 1.0) != EXPERIMENTS["c"].texture(reduced).scales
-    assert EXPERIMENTS["c.paper"].train(reduced).blank == 0 < EXPERIMENTS["c"].train(reduced).blank
-    assert EXPERIMENTS["b.2"].train(reduced).blank == 0
+    assert EXPERIMENTS["c.paper"].blank(reduced) == EXPERIMENTS["b.2"].blank(reduced) == 0 < EXPERIMENTS["c"].blank(reduced)
     assert EXPERIMENTS["c"].model(reduced).ground_start and not EXPERIMENTS["c.paper"].model(reduced).ground_start
     assert ours["model"] == paper["model"]  # this scale's choices are the paper's already
 

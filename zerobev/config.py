@@ -124,7 +124,6 @@ class TrainConfig:
     batch: int = 16
     alpha: float = 0.5  #: weight of the auxiliary loss
     weight_decay: float = 0.0
-    blank: float = 0.0  #: share of the samples whose zero-shot image, and its map, are made empty (not in the paper)
 
 
 @dataclass(frozen=True)
@@ -138,6 +137,7 @@ class Scale:
     train: TrainConfig
     depth: TrainConfig  #: of the depth estimator
     texture: TextureConfig = field(default_factory=TextureConfig)
+    blank: float = 0.0  #: share of the samples whose zero-shot image, and its map, are made empty (not in the paper)
     test_views: int | None = None  #: of each test scene, the first ones, that networks are evaluated on; None: all
     #: first weights of the RGB backbones, as `models.weights.load_backbone` takes them; empty: the depth estimator's
     backbone: str = ""
@@ -199,10 +199,10 @@ SCALES = {
                 decay=0.85,
                 validate_every=100,
                 warmup=30,
-                blank=0.2,
             ),
             depth=TrainConfig(steps=8000, learning_rate=4e-3, decay_every=220, validate_every=1000, warmup=50),
             texture=TextureConfig(scales=(0.25, 1.0)),
+            blank=0.2,
             test_views=40,
         ),
         Scale(

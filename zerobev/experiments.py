@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from zerobev.config import ModelConfig, Scale, TextureConfig, TrainConfig
+from zerobev.config import ModelConfig, Scale, TextureConfig
 from zerobev.errors import InputError
 from zerobev.models.variants import VARIANTS
 
@@ -35,9 +35,9 @@ class Experiment:
         plain = {"ground_start": False, "zero_gain": 1.0, "residual_gain": 1.0}
         return replace(scale.model, **plain) if self.paper_start else scale.model
 
-    def train(self, scale: Scale) -> TrainConfig:
-        """How it is trained. The masks of the classes need no blank samples: many are empty."""
-        return replace(scale.train, blank=0.0) if self.paper_start or self.stream == "classes" else scale.train
+    def blank(self, scale: Scale) -> float:
+        """The share of blank samples. The masks of the classes need none: many are empty."""
+        return 0.0 if self.paper_start or self.stream == "classes" else scale.blank
 
 
 def _experiments() -> dict[str, Experiment]:

@@ -61,7 +61,7 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
     if experiment.network is not None:
         texture = workspace.texture_identity(experiment.texture(scale))
         config |= {"model": asdict(experiment.model(scale)), "backbone": _backbone(experiment, scale)}
-        config |= {"train": asdict(experiment.train(scale)), "texture": texture}
+        config |= {"train": asdict(scale.train), "texture": texture, "blank": experiment.blank(scale)}
     return config
 
 
@@ -118,7 +118,7 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     Its RGB backbone starts from the scale's pretrained weights, all else from the seed. Validation is on the stream
     that it is trained on, with the depth of the last stage, and with one fixed seed, so that scores of runs compare.
     """
-    scale, config = workspace.scale, experiment.train(workspace.scale)
+    scale, config = workspace.scale, workspace.scale.train
     torch.manual_seed(seed)
     model = build(experiment.network, scale.camera, experiment.model(scale))
     load_backbone(model.backbone, _backbone(experiment, scale) or DepthPretraining(workspace).weights)
@@ -146,10 +146,10 @@ def _stages(experiment: Experiment) -> tuple[str, ...]:
 def stream(experiment: Experiment, workspace: Workspace, part: str, depth: str, seed: int) -> Source:
     """The tuples of a split that an experiment trains on; depth: "gt" or "predicted"."""
     views: ViewSet = DepthPretraining(workspace).views(part) if depth == "predicted" else workspace.views(part)
-    config = experiment.train(workspace.scale)
-    common = (workspace.scale.camera, seed, config.batch, config.blank)
+    scale = workspace.scale
+    common = (scale.camera, seed, scale.train.batch, experiment.blank(scale))
     if experiment.stream == "synth":
-        return SynthTuples(views, workspace.bank(experiment.texture(workspace.scale)), *common, experiment.fresh)
+        return SynthTuples(views, workspace.bank(experiment.texture(scale)), *common, experiment.fresh)
     return {"modsem": ModSemTuples, "depthproj": DepthProjTuples, "classes": SemanticTuples}[experiment.stream](
         views, *common
     )
