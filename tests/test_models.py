@@ -226,7 +226,7 @@ def test_residual_gain_scales_what_the_projection_adds():
         torch.manual_seed(0)
         net = build("d", SCALES["smoke"].camera, replace(SCALES["smoke"].model, residual_gain=gain)).eval()
         seen = []
-        net.decoder.register_forward_pre_hook(lambda module, features: seen.append(features[0]))
+        net.decoder.register_forward_pre_hook(lambda module, features, seen=seen: seen.append(features[0]))
         with torch.inference_mode():
             for planes in (depth, torch.zeros_like(depth)):  # depth 0: no pixel reaches the map
                 net(torch.zeros(1, 3, 32, 32), zero, planes)

@@ -127,9 +127,7 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     held_out = stream(experiment, workspace, "validation", _stages(experiment)[-1], seed=0)
     validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]
     objective = dice_objective(config.alpha, model.config.aux)
-    history = train(
-        model, InTurn(stages, config.steps), validation, config, folder, seed, key=key, objective=objective
-    )
+    history = train(model, InTurn(stages, config.steps), validation, config, folder, seed, key=key, objective=objective)
     model.save(folder / "model.safetensors")
     return model, history
 

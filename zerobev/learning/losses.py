@@ -67,7 +67,9 @@ def zero_bev_loss(
     aux: names of the A maps that the model predicts, its `config.aux`
     """
     zero = dice_loss(projection.zero_logits.float().sigmoid(), batch["target"], batch["fov"])
-    minimised = zero if projection.pooled is None else zero + dice_loss(projection.pooled, batch["target"], batch["fov"])
+    minimised = zero
+    if projection.pooled is not None:
+        minimised = zero + dice_loss(projection.pooled, batch["target"], batch["fov"])
     if projection.aux_logits is None:
         return Losses(minimised, zero)
     true_aux = batch["aux"][:, [AUX.index(name) for name in aux]]

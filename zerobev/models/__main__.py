@@ -12,7 +12,10 @@ from zerobev.models.variants import VARIANTS, build
 from zerobev.paper import PARAMETERS_M
 from zerobev.storage import write_json
 
-BLOCKS = ("backbone", "zero_cnn", "pyramid", "bands", "view", "outs", "gates", "values", "embedding", "decoder", "total")
+BLOCKS = (
+    *("backbone", "zero_cnn", "pyramid", "bands", "view", "outs", "gates", "values", "embedding", "decoder"),
+    "total",
+)
 
 
 def parameters(network: nn.Module) -> dict[str, int]:

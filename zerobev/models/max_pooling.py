@@ -2,11 +2,11 @@
 
 photograph -> backbone -> pyramid -> gates: does this pixel show at that position of its ray?
                             :          :
-                            :          :--- noisy OR with the zero-shot image, as it is --> pooled map -> embedding --.
-                            '----------'--- mean, weighted with the gates ---------------> map features ------------ + -> U-Net
+                            :          :-- noisy OR with the zero-shot image, as it is -> embedding --.
+                            '----------'-- mean, weighted with the gates -> map features ------------ + -> U-Net
 
-The paper's supplement calls max-pooling along the vertical the open point of its Theorem 3.1: attention averages, and an
-average of binary values is no maximum. Gates that each say yes or no, and an OR over them, are one.
+The paper's supplement calls max-pooling along the vertical the open point of its Theorem 3.1: attention averages, and
+an average of binary values is no maximum. Gates that each say yes or no, and an OR over them, are one.
 """
 
 import torch
@@ -49,8 +49,8 @@ def noisy_or(logits: Tensor, values: Tensor) -> Tensor:
 class Gates(nn.Module):
     """For each pixel of the photograph and each position of its column's ray, whether the one shows on the other.
 
-    A logit is the sum of what the pixel's features tell and of what its row does. The latter starts at the projection of
-    a flat floor.
+    A logit is the sum of what the pixel's features tell and of what its row does. The latter starts at the projection
+    of a flat floor.
     """
 
     def __init__(self, camera: CameraConfig, width: int, stride: int):
@@ -72,8 +72,8 @@ class MaxPoolZeroBEV(BevModel):
     """Geometry from the photograph alone, values that no network touches before they are on the map.
 
     Each pixel of the zero-shot image keeps its own gates, so that the pooled map is as fine as the image allows; the
-    U-Net, which sees the photograph's features on the map too, then completes what is hidden. Gates do not depend on the
-    zero-shot images and are computed once for all of them.
+    U-Net, which sees the photograph's features on the map too, then completes what is hidden. Gates do not depend on
+    the zero-shot images and are computed once for all of them.
     """
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
@@ -113,7 +113,7 @@ class MaxPoolZeroBEV(BevModel):
 
     def map_features(self, features: Tensor, gates: Tensor) -> Tensor:
         """The photograph's features (B, d, R, C) on the map, (B, d, M, M): their mean, weighted with the gates."""
-        stride, (rows, columns) = self.config.stem_stride, features.shape[-2:]
+        stride, rows = self.config.stem_stride, features.shape[-2]
         open_ = gates[:, ::stride].sigmoid()  # B C P H
         open_ = F.pad(open_, (0, rows * stride - open_.shape[-1])).unflatten(-1, (rows, stride)).mean(-1)
         weights = open_ / (open_.sum(-1, keepdim=True) + 0.01)

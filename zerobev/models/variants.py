@@ -1,4 +1,4 @@
-"""Every network by the letter of its row in the paper's Tables 1 and 2 or, past the paper, (f); and by its checkpoint."""
+"""Every network by the letter of its row in the paper's Tables 1 and 2, or (f), and by its checkpoint."""
 
 from dataclasses import replace
 from pathlib import Path
