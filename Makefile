@@ -36,6 +36,7 @@ reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper SC
 	if [ -n "$$TEXTURES" ]; then export ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"; fi
 	$(PYTHON) -m zerobev.reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${TEXTURES:+--textures "$$TEXTURES"} $${fresh:+--fresh}
+	$(PYTHON) -m zerobev.summary --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"}
 	[ -n "$$fresh" ] || $(PYTHON) -m zerobev.spot_check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${SPOT:+--row "$$SPOT"}
 

@@ -18,7 +18,7 @@ from zerobev.models.variants import VARIANTS
 from zerobev.paper import TABLES
 from zerobev.pretraining import DepthPretraining
 from zerobev.records import RecordStore
-from zerobev.runs import InTurn, run, run_key, stream, train_run
+from zerobev.runs import InTurn, recorded, records_of, run, run_key, stream, train_run
 from zerobev.spot_check import spot_check
 from zerobev.streams.projection import project
 from zerobev.streams.tuples import semantic_batches
@@ -155,6 +155,18 @@ def test_the_depth_estimator_is_recorded_and_read(workspace, monkeypatch):
     monkeypatch.setitem(SCALES, "tiny", replace(TINY, depth=replace(TINY.depth, steps=5)))
     changed = DepthPretraining(Workspace("tiny", root=workspace.reports.parents[1]))
     assert changed.key != record["key"]
+
+
+def test_records_of_rows_are_those_of_every_recorded_seed(workspace):
+    store = RecordStore(workspace.reports)
+    assert [(r.row, r.seed) for r in recorded(["c", "a.1", "e", "c"], workspace)] == [("c", 0), ("a.1", 0)]
+    second = replace(run(PROJECTION, workspace), key=run_key(PROJECTION, workspace, 1), seed=1)
+    store.write(second, np.zeros((1, 8, 20, 20), bool))
+    try:
+        found = records_of(["a.1", "a.2"], workspace)
+        assert [(r.row, r.seed) for r in found] == [("a.1", 0), ("a.1", 1), ("a.2", 0)]
+    finally:
+        store.path(second.key).unlink()
 
 
 def test_the_record_says_where_it_comes_from(workspace):

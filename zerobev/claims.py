@@ -30,7 +30,7 @@ class Verdict:
     id: str
     table: int
     claim: str
-    paper: float  #: IoU points
+    paper: float | None  #: IoU points; None where the paper has no such row
     ours: float | None
     low: float | None  #: 90 % interval over test scenes
     high: float | None
@@ -38,7 +38,7 @@ class Verdict:
 
 
 def judge(claim: Ordering | Similar, records: Sequence[Record]) -> Verdict:
-    """Whether a claim holds here too.
+    """Whether a claim of the paper holds here too, or one of `zerobev.beyond` at all.
 
     An ordering holds where the interval of the paired gain lies above zero, and does not where it lies below. Rows
     are similar where the interval of their spread lies below the claim's `points`, and are not where it lies above.
@@ -46,11 +46,14 @@ def judge(claim: Ordering | Similar, records: Sequence[Record]) -> Verdict:
     `InputError`.
     """
     rows, measure = _measured(claim)
-    published = float(measure(np.array([_published(TABLES[claim.table][row], claim.metric) for row in rows])))
+    published = TABLES.get(claim.table, {})
+    paper = None
+    if set(rows) <= set(published):
+        paper = round(float(measure(np.array([_published(published[row], claim.metric) for row in rows]))), 1)
     text = f"{_named(claim)}: {claim.text}"
     found = _measure(rows, claim.metric, measure, records)
     if found is None:
-        return Verdict(claim.id, claim.table, text, round(published, 1), None, None, None, "not run")
+        return Verdict(claim.id, claim.table, text, paper, None, None, None, "not run")
     ours, low, high = (round(100 * value, 1) for value in found)
     # judged on what is not rounded
     lowest, highest = 100 * found[1], 100 * found[2]
@@ -58,7 +61,7 @@ def judge(claim: Ordering | Similar, records: Sequence[Record]) -> Verdict:
         verdict = "holds" if lowest > 0 else "does not hold" if highest < 0 else "undecided"
     else:
         verdict = "holds" if highest < claim.points else "does not hold" if lowest > claim.points else "undecided"
-    return Verdict(claim.id, claim.table, text, round(published, 1), ours, low, high, verdict)
+    return Verdict(claim.id, claim.table, text, paper, ours, low, high, verdict)
 
 
 def compare(ratio: Ratio, records: Sequence[Record]) -> dict[str, str | float | None]:

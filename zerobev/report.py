@@ -1,6 +1,6 @@
 """Records and the paper's numbers -> the tables and figures that notebooks share."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,9 +8,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from zerobev.beyond import OWN_ROWS
 from zerobev.claims import Verdict
 from zerobev.config import LABELS, CameraConfig
-from zerobev.paper import Row
+from zerobev.learning.metrics import bootstrap_interval, class_iou, pixel_iou
+from zerobev.paper import TABLES
 from zerobev.records import Record
 from zerobev.scenes.scene import Scene
 from zerobev.sensors.cameras import Pose
@@ -25,28 +27,49 @@ _OUTSIDE = "#ffffff"
 pd.set_option("display.max_colwidth", None)
 
 
-def table(rows: dict[str, Row], records: Sequence[Record]) -> pd.DataFrame:
-    """The paper's rows above ours, IoU in percent; ours are means over the records' seeds.
+def table(number: int, records: Sequence[Record]) -> pd.DataFrame:
+    """A table of the paper, its rows above ours, IoU in percent; ours are means over the records' seeds.
 
-    rows: a table of `zerobev.paper.TABLES`. Rows of which there is no record are shown with the paper's
-    numbers alone, so that what is missing is seen.
+    Rows of `zerobev.beyond` follow. Rows of which there is no record are shown with the paper's numbers alone, so that
+    what is missing is seen.
     """
     lines = []
-    for letter, row in rows.items():
-        lines.append((letter, row.method, "paper", *row.per_class, row.class_iou, row.pixel_iou))
+    for letter, method in rows_of(number).items():
+        if (row := TABLES.get(number, {}).get(letter)) is not None:
+            lines.append((letter, method, "paper", *row.per_class, row.class_iou, row.pixel_iou))
         mine = [record.counts for record in records if record.row == letter]
         if mine:
             per_class = np.mean([counts.iou_per_class() for counts in mine], axis=0)
             averages = np.mean([[counts.class_iou(), counts.pixel_iou()] for counts in mine], axis=0)
-            lines.append((letter, row.method, "ours", *(100 * per_class), *(100 * averages)))
+            lines.append((letter, method, "ours", *(100 * per_class), *(100 * averages)))
     columns = ["row", "method", "source", *LABELS, "class avg.", "pixel avg."]
     return pd.DataFrame(lines, columns=columns).set_index(["row", "method", "source"]).round(1)
+
+
+def rows_of(number: int) -> dict[str, str]:
+    """Row -> method of a table: the paper's rows, then those of `zerobev.beyond`."""
+    published = {letter: row.method for letter, row in TABLES.get(number, {}).items()}
+    return published | OWN_ROWS.get(number, {})
+
+
+def cost_table(records: Sequence[Record]) -> pd.DataFrame:
+    """Where numbers come from: seed, device, steps and seconds of each run, from its record."""
+    columns = ["row", "seed", "device", "steps", "train [s]", "evaluate [s]", "memory [MB]", "test homes", "revision"]
+    lines = [
+        (
+            *(r.row, r.seed, r.origin.get("device"), r.config.get("train", {}).get("steps", 0)),
+            *(r.cost.get(name) for name in ("train_seconds", "evaluate_seconds", "peak_memory_mb")),
+            *(len(r.scenes), r.origin.get("revision")),
+        )
+        for r in records
+    ]
+    return pd.DataFrame(lines, columns=columns).set_index(["row", "seed"])
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
     """Claims and verdicts for a notebook, differences in IoU points."""
     frame = pd.DataFrame([vars(verdict) for verdict in verdicts]).set_index("id").drop(columns="table")
-    return frame.astype({"ours": float, "low": float, "high": float})
+    return frame.astype({"paper": float, "ours": float, "low": float, "high": float})
 
 
 def label_image(label: np.ndarray, fov: np.ndarray | None = None) -> np.ndarray:
@@ -64,6 +87,43 @@ def maps_image(maps: np.ndarray, fov: np.ndarray) -> np.ndarray:
             label = np.where(mask, index, label)
     label = np.where((label == len(LABELS)) & maps[LABELS.index("floor")], LABELS.index("floor"), label)
     return label_image(label, fov)
+
+
+def averages_figure(number: int, records: Sequence[Record]) -> Figure:
+    """Both averages of each row of a table: ours with 90 % intervals over test scenes, the paper's as crosses."""
+    rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
+    figure, panels = plt.subplots(1, 2, figsize=(8, 0.9 + 0.28 * len(rows)), sharey=True)
+    for axes, (name, statistic) in zip(panels, {"class": class_iou, "pixel": pixel_iou}.items()):
+        for y, row in enumerate(rows):
+            counts = [record.counts for record in records if record.row == row]
+            low, high = bootstrap_interval(counts, statistic, np.random.default_rng(0))
+            mean = np.mean([one.value(statistic) for one in counts])
+            axes.plot([100 * low, 100 * high], [y, y], color=COLORS[4], linewidth=3, alpha=0.5)
+            axes.plot(100 * mean, y, "o", color=COLORS[4], label="ours")
+            if (published := TABLES.get(number, {}).get(row)) is not None:
+                axes.plot(published.class_iou if name == "class" else published.pixel_iou, y, "x", color=COLORS[0])
+        axes.set(xlabel=f"{name} IoU [%]", xlim=(0, None))
+        axes.grid(axis="x", alpha=0.3)
+    panels[0].set_yticks(range(len(rows)), [f"({row})" for row in rows])
+    panels[0].invert_yaxis()
+    figure.tight_layout()
+    return figure
+
+
+def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarray], side: float = 1.2) -> Figure:
+    """Views of test homes, one a line: photograph, its labels, the maps of each row, and the truth.
+
+    views: as `zerobev.gallery.gallery` returns them
+    maps: row -> (N, 8, M, M) bool, as `RecordStore.maps` returns them
+    """
+    truth = [label_image(label, fov) for label, fov in zip(views["bev_label"], views["fov"])]
+    predicted = [
+        (f"({row})", [maps_image(m, fov) for m, fov in zip(masks, views["fov"])]) for row, masks in maps.items()
+    ]
+    labels = [label_image(label) for label in views["fpv_label"]]
+    figure = grid([("photograph", views["rgb"]), ("FPV labels", labels), *predicted, ("truth", truth)], side)
+    add_legend(figure)
+    return figure
 
 
 def grid(columns: Sequence[tuple[str, Sequence[np.ndarray]]], side: float = 1.5) -> Figure:

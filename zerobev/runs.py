@@ -1,13 +1,14 @@
 """The one way to get a run's record: read it, or compute it."""
 
 import time
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
 import torch
 
 from zerobev.config import LABELS, Scale
-from zerobev.experiments import Experiment
+from zerobev.experiments import EXPERIMENTS, Experiment
 from zerobev.gallery import gallery_indices
 from zerobev.learning.evaluate import Projector, evaluate, model_projector
 from zerobev.learning.train import History, Source, dice_objective, train
@@ -33,6 +34,8 @@ from zerobev.workspace import Workspace, fingerprint
 #: Raised by hand whenever training or evaluation change what they compute: older records are then left aside.
 RECIPE_VERSION = 3
 
+#: Of the reference runs; the first one is computed where it is missing.
+SEEDS = (0, 1, 2)
 VALIDATION_BATCHES = 4
 _EVALUATION_BATCH = 16
 
@@ -45,6 +48,21 @@ def run(experiment: Experiment, workspace: Workspace, seed: int = 0) -> Record:
     """
     store = RecordStore(workspace.reports)
     return store.find(run_key(experiment, workspace, seed)) or compute(experiment, workspace, seed, store)
+
+
+def recorded(rows: Iterable[str], workspace: Workspace) -> list[Record]:
+    """The records of rows, with every seed of `SEEDS` that there is; nothing is computed."""
+    store = RecordStore(workspace.reports)
+    keys = [run_key(EXPERIMENTS[row], workspace, seed) for row in dict.fromkeys(rows) for seed in SEEDS]
+    return [record for record in map(store.find, keys) if record is not None]
+
+
+def records_of(rows: Iterable[str], workspace: Workspace) -> list[Record]:
+    """As `recorded`, after the first seed of each row was computed where it was missing."""
+    rows = list(rows)
+    for row in rows:
+        run(EXPERIMENTS[row], workspace, SEEDS[0])
+    return recorded(rows, workspace)
 
 
 def run_key(experiment: Experiment, workspace: Workspace, seed: int) -> str:
