@@ -11,12 +11,14 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 from safetensors.torch import load_file, load_model
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
 from zerobev.errors import InputError
 from zerobev.learning import train as training
+from zerobev.learning.history import History
 from zerobev.learning.losses import Losses, dice_loss
 from zerobev.learning.schedule import Schedule
 from zerobev.learning.train import dice_objective, train
@@ -27,6 +29,7 @@ CONFIG = TrainConfig(steps=20, learning_rate=0.01, decay_every=8, validate_every
 class Maps(NamedTuple):
     zero_logits: Tensor
     aux_logits: Tensor | None
+    pooled: Tensor | None = None
 
 
 class StandIn(nn.Module):
@@ -82,7 +85,7 @@ class Stuck(Samples):
 VALIDATION = [samples(range(10_000, 10_004)), samples(range(10_004, 10_008))]
 
 
-def run(folder: Path, data=None, seed: int = 0, key: str = "run", **arguments) -> training.History:
+def run(folder: Path, data=None, seed: int = 0, key: str = "run", **arguments) -> History:
     torch.set_num_threads(1)
     return train(StandIn(), data or Samples(), VALIDATION, CONFIG, folder, seed, key=key, device="cpu", **arguments)
 
@@ -204,6 +207,19 @@ def test_learns(tmp_path):
     assert "forward" not in vars(model), "nothing is left wrapped"
     predicted = model(eight["rgb"], eight["zero"]).zero_logits.sigmoid()
     assert dice_loss(predicted, eight["target"], eight["fov"]) < 0.05
+
+
+def test_pictures_are_drawn_at_every_validation(tmp_path):
+    """Curves always; a sample where the caller draws one, of the first validation batch."""
+    seen = []
+
+    def picture(model: nn.Module, batch: dict[str, Tensor]) -> Figure:
+        seen.append((model.training, torch.equal(batch["zero"], VALIDATION[0]["zero"])))
+        return Figure()
+
+    run(tmp_path, picture=picture)
+    assert seen == [(False, True)] * 4  # steps 6, 12, 18 and 20
+    assert {"curves.png", "sample.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_same_seed_same_bytes(unbroken, tmp_path):

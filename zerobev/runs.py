@@ -11,7 +11,9 @@ from zerobev.config import LABELS, Scale
 from zerobev.experiments import EXPERIMENTS, Experiment
 from zerobev.gallery import gallery_indices
 from zerobev.learning.evaluate import Projector, evaluate, model_projector
-from zerobev.learning.train import History, Source, dice_objective, train
+from zerobev.learning.history import History
+from zerobev.learning.monitor import maps_figure
+from zerobev.learning.train import Source, dice_objective, train
 from zerobev.models.checkpoint import BevModel
 from zerobev.models.variants import VARIANTS, build
 from zerobev.models.vpn import VPN
@@ -145,7 +147,8 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     held_out = stream(experiment, workspace, "validation", _stages(experiment)[-1], seed=0)
     validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]
     objective = dice_objective(config.alpha, model.config.aux)
-    history = train(model, InTurn(stages, config.steps), validation, config, folder, seed, key=key, objective=objective)
+    data = InTurn(stages, config.steps)
+    history = train(model, data, validation, config, folder, seed, key=key, objective=objective, picture=maps_figure)
     model.save(folder / "model.safetensors")
     return model, history
 

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
+from zerobev.learning.history import History
 from zerobev.learning.losses import Losses
-from zerobev.learning.train import History, train
+from zerobev.learning.train import train
 from zerobev.models.depth import DepthEstimator
 from zerobev.streams.tuples import ViewOrder, ViewSet
 

@@ -13,20 +13,23 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from accelerate import Accelerator
+from matplotlib.figure import Figure
 from safetensors.torch import save_model
 from torch import Tensor, nn
 
 from zerobev.config import AUX, TrainConfig
 from zerobev.errors import InputError
 from zerobev.learning.evaluate import model_inputs
+from zerobev.learning.history import Entry, History, columns
 from zerobev.learning.losses import Losses, zero_bev_loss
+from zerobev.learning.monitor import curves_figure, write_picture
 from zerobev.learning.schedule import Schedule
 from zerobev.progress import progress
 from zerobev.storage import replacing
@@ -36,6 +39,7 @@ HISTORY_ENTRIES = 1000  #: about as many are kept of a run, beside those at vali
 
 Batch = Mapping[str, Tensor]
 Objective = Callable[[nn.Module, Batch], Losses]
+Picture = Callable[[nn.Module, Batch], Figure]
 log = logging.getLogger("zerobev.train")
 
 
@@ -49,35 +53,6 @@ class Source(Protocol):
         `ranks`-th of them, from `rank` on. Depends on nothing else, may be called from another thread, and does not
         touch torch's global generator.
         """
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A line of the history; losses are means since the entry before."""
-
-    step: int  #: steps done
-    loss: float
-    main: float  #: loss of the evaluated output (the zero-shot stream)
-    aux: float | None
-    learning_rate: float  #: of the last step
-    seconds: float  #: of training so far, without those lost to an interruption
-    validation: float | None  #: score of the model after this step, where it was validated
-
-
-@dataclass(frozen=True)
-class History:
-    """What a finished run tells of itself."""
-
-    entries: tuple[Entry, ...]
-    best_step: int  #: whose weights were kept
-    best_score: float
-    seconds: float
-
-    def curves(self) -> dict[str, list[float | None]]:
-        """Columns of the history, thinned to about a hundred entries beside those at validations: for a record."""
-        stride = max(len(self.entries) // 100, 1)
-        kept = [e for i, e in enumerate(self.entries) if i % stride == 0 or e.validation is not None]
-        return {name: [getattr(e, name) for e in kept] for name in ("step", "loss", "main", "aux", "validation")}
 
 
 def dice_objective(alpha: float, aux: tuple[str, ...] = AUX) -> Objective:
@@ -98,6 +73,7 @@ def train(
     *,
     key: str,
     objective: Objective | None = None,
+    picture: Picture | None = None,
     device: torch.device | str | None = None,
 ) -> History:
     """Train `model` in place; it is left on the device, in evaluation mode, with the weights that validated best.
@@ -106,11 +82,13 @@ def train(
     validation: fixed batches. Their mean `main` loss is the score, lower is better: for Zero-BEV the Dice loss of
         the zero-shot stream. Unlike an IoU it has no threshold, so that it moves early in training already,
         and on *Synth* textures it needs no semantic label: the choice of weights stays zero-shot.
-    folder: receives `checkpoint.pt`, `best.safetensors` (at the end), `history.jsonl` and `train.log`
+    folder: receives `checkpoint.pt`, `best.safetensors` (at the end), `history.jsonl`, `train.log` and, renewed at
+        every validation, `curves.png` and `sample.png`
     seed: of dropout; `data` has its own
     key: names the run. A checkpoint with this key is taken up, one with another is an `InputError`, and one that
         cannot be read is reported in the log and replaced.
     objective: losses of a batch; by default `dice_objective(config.alpha)`
+    picture: draws what the model does with the first validation batch, for `sample.png`
     device: default: a GPU if there is one. Forward passes are bfloat16 where the processor computes in it.
     """
     accelerator = _accelerator(device)
@@ -127,6 +105,7 @@ def train(
                     run.advance(objective, batch)
                     if run.step % config.validate_every == 0 or run.step == config.steps:
                         run.validate(objective, validation)
+                        run.show(picture, validation[0])
                     elif run.step % -(-config.steps // HISTORY_ENTRIES) == 0:
                         run.record(None)
                     run.checkpoint_if_due()
@@ -193,6 +172,14 @@ class _Run:
             self.best_step, self.best_score = self.step, score
         self.record(score)
         self.save()
+
+    def show(self, picture: Picture | None, batch: Batch) -> None:
+        """Draw the curves so far, and what the model does with a batch."""
+        if not self.accelerator.is_main_process:
+            return
+        write_picture(curves_figure(columns(self.entries)), self.folder / "curves.png")
+        if picture is not None:
+            write_picture(picture(self.bare, _moved(batch, self.accelerator)), self.folder / "sample.png")
 
     def record(self, score: float | None) -> None:
         """Add an entry to the history, its file and the log."""
