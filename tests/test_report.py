@@ -1,5 +1,8 @@
 """Tables, verdicts and pictures from records whose numbers are known by hand; the paper's own sums."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,12 +10,23 @@ from matplotlib.colors import to_rgb
 from records_for_tests import record
 from scenes_for_tests import box, build, room
 
+from zerobev.beyond import OWN_CLAIMS
 from zerobev.claims import judge
 from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.learning.metrics import Counts
 from zerobev.paper import CLAIMS, TABLES
 from zerobev.records import Record
-from zerobev.report import COLORS, Checks, label_image, maps_image, metric_extent, plan, table, verdict_table
+from zerobev.report import (
+    COLORS,
+    Checks,
+    label_image,
+    maps_image,
+    metric_extent,
+    plan,
+    scoreboard,
+    table,
+    verdict_table,
+)
 
 ROWS = TABLES[1]
 
@@ -133,3 +147,13 @@ def test_checks_note_what_holds_and_stop_at_what_does_not():
         {"expected": ["2", "c > d"], "verdict": ["holds", "undecided"]}, index=pd.Index(["sum", "order"], name="claim")
     )
     pd.testing.assert_frame_equal(checks.table(), expected, check_dtype=False)
+
+
+def test_scoreboard_links_every_claim_to_a_notebook_that_is_there():
+    verdicts = [judge(claim, [record("c", [[30.0] * 8] * 3)]) for claim in (*CLAIMS, *OWN_CLAIMS)]
+    _, _, *lines = scoreboard(verdicts).data.splitlines()
+    assert [line.split("|")[1].strip() for line in lines] == [verdict.id for verdict in verdicts]
+    for line in lines:
+        (link,) = re.findall(r"\]\((.*?)\)", line)
+        assert (Path(__file__).parents[1] / "notebooks" / link).is_file()
+        assert "**not run**" in line

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from IPython.display import Markdown
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -20,6 +21,15 @@ from zerobev.sensors.gbuffer import RayCaster
 
 #: One colour a class, in the order of `LABELS`; what is none of them is light grey.
 COLORS = ("#4c566a", "#c9b79c", "#e07a1f", "#3a7d44", "#2f6db5", "#7cc36e", "#b04fb0", "#d62839")
+#: Where each table is shown; table 6 is not in the paper.
+NOTEBOOKS = {
+    1: "05_table1_zero_shot",
+    2: "06_table2_model_variants",
+    3: "07_table3_residual_depth",
+    4: "08_table4_data_density",
+    5: "09_table5_data_generation",
+    6: "09_table5_data_generation",
+}
 _NOTHING = "#ececec"
 _OUTSIDE = "#ffffff"
 
@@ -70,6 +80,17 @@ def verdict_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
     """Claims and verdicts for a notebook, differences in IoU points."""
     frame = pd.DataFrame([vars(verdict) for verdict in verdicts]).set_index("id").drop(columns="table")
     return frame.astype({"paper": float, "ours": float, "low": float, "high": float})
+
+
+def scoreboard(verdicts: Sequence[Verdict]) -> Markdown:
+    """Every claim with its verdict and a link to the notebook that shows it; differences in IoU points."""
+    lines = ["| | claim | paper | ours | 90 % interval | verdict | |", "|---|---|---|---|---|---|---|"]
+    for v in verdicts:
+        paper, ours = ("" if value is None else f"{value:+.1f}" for value in (v.paper, v.ours))
+        interval = "" if v.low is None else f"{v.low:+.1f} to {v.high:+.1f}"
+        link = f"[notebook {int(NOTEBOOKS[v.table][:2])}]({NOTEBOOKS[v.table]}.ipynb)"
+        lines.append(f"| {v.id} | {v.claim} | {paper} | {ours} | {interval} | **{v.verdict}** | {link} |")
+    return Markdown("\n".join(lines))
 
 
 def label_image(label: np.ndarray, fov: np.ndarray | None = None) -> np.ndarray:
