@@ -12,7 +12,6 @@ OWN_ROWS: dict[int, dict[str, str]] = {
         "c": "textures of drawn scale, new for every sample",
         "c.fixed": "textures of one scale, new for every sample",
         "c.once": "textures of drawn scale, one a scene",
-        "c.fixed.once": "textures of one scale, one a scene",
         "c.paper": "textures as in the paper, no blank samples, rays not started at the ground",
     },
 }

@@ -73,7 +73,6 @@ def _experiments() -> dict[str, Experiment]:
         # beyond the paper: how large structures are, how often they change, and the paper's choice in all we differ in
         Experiment("c.fixed", scales=(1.0, 1.0)),
         Experiment("c.once", fresh=False),
-        Experiment("c.fixed.once", scales=(1.0, 1.0), fresh=False),
         Experiment("c.paper", scales=(1.0, 1.0), fresh=False, paper_start=True),
     )
     return {experiment.row: experiment for experiment in rows}

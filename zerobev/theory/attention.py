@@ -1,0 +1,122 @@
+"""The two-stream network of the paper's Eqs. 7 and 8, cross-attention alone, and its training on the aux stream."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from zerobev.theory.correspondence import Columns, uniform_attention
+
+#: How many columns the divergence is measured on during training, and how often.
+_MEASURED, _EVERY = 256, 10
+
+Stream = Callable[[Tensor, Tensor], Tensor]
+
+
+class CrossAttention(nn.Module):
+    """One layer with one head (paper, Eqs. 3 and 4), its attention shared by two streams of values (Eqs. 7 and 8).
+
+    A query is a trained vector for each position, which stands for W_Q on a positional encoding. There is nothing else:
+    no backbone, no feed-forward layer, no normalisation.
+
+    value: (A, A') channels of the aux stream's trained value projection; None: it is the identity, too
+    """
+
+    def __init__(
+        self,
+        positions: int,
+        features: int,
+        rng: np.random.Generator,
+        width: int = 64,
+        value: tuple[int, int] | None = None,
+    ):
+        super().__init__()
+        self.queries = _normal((positions, width), 1.0, rng)  # p W_Q
+        self.keys = _normal((features, width), features**-0.5, rng)  # W_K
+        self.value = None if value is None else _normal(value, value[0] ** -0.5, rng)  # W_V
+
+    def logits(self, features: Tensor) -> Tensor:
+        """Columns (N, R, F) -> e of Eq. 3, (N, P, R)."""
+        return self.queries @ (features @ self.keys).mT * self.queries.shape[-1] ** -0.5
+
+    def attention(self, features: Tensor) -> Tensor:
+        """Columns (N, R, F) -> alpha of Eq. 3, (N, P, R); sums to 1 over R."""
+        return self.logits(features).softmax(-1)
+
+    def aux(self, features: Tensor, values: Tensor) -> Tensor:
+        """Eq. 7: values (N, R, A) -> rays (N, P, A')."""
+        return self.attention(features) @ (values if self.value is None else values @ self.value)
+
+    def zero(self, features: Tensor, values: Tensor) -> Tensor:
+        """Eq. 8: values (N, R, K) of any modalities, as they are -> rays (N, P, K)."""
+        return self.attention(features) @ values
+
+
+class Progress(NamedTuple):
+    """A training, seen every ten steps."""
+
+    step: list[int]
+    loss: list[float]
+    divergence: list[float]  #: from gamma, as `divergence` measures it
+
+
+def train(
+    net: CrossAttention,
+    stream: Stream,
+    columns: Columns,
+    values: Tensor,
+    target: Tensor,
+    rng: np.random.Generator,
+    steps: int = 300,
+    batch: int = 96,
+    learning_rate: float = 0.03,
+) -> Progress:
+    """Minimise the squared error of one stream where some pixel falls; the network is changed in place.
+
+    stream: `net.aux`, or another function of features (n, R, F) and values (n, R, A) that uses the network
+    values: (N, R, A) of the image columns; target: (N, P, A') of their rays
+    """
+    adam = torch.optim.Adam(net.parameters(), learning_rate)
+    decay = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: 1 - step / steps)
+    progress = Progress([], [], [])
+    for step in range(steps + 1):
+        some = torch.from_numpy(rng.integers(len(values), size=batch))
+        error = stream(columns.features[some], values[some]) - target[some]
+        loss = error[columns.gamma[some].any(-1)].square().mean()
+        if step % _EVERY == 0:
+            measured = divergence(net, Columns(*(part[:_MEASURED] for part in columns)))
+            for noted, value in zip(progress, (step, float(loss.detach()), measured)):
+                noted.append(value)
+        if step < steps:
+            adam.zero_grad()
+            loss.backward()
+            adam.step()
+            decay.step()
+    return progress
+
+
+@torch.no_grad()
+def divergence(net: CrossAttention, columns: Columns) -> float:
+    """Total variation between the attention and gamma's, in [0, 1], averaged over positions that some pixel falls into.
+
+    For values in [0, 1] no modality can be wrong by more than that at a position, and one modality is.
+    """
+    return float(total_variation(net.attention(columns.features), columns.gamma)[columns.gamma.any(-1)].mean())
+
+
+def total_variation(attention: Tensor, gamma: Tensor) -> Tensor:
+    """Half the summed difference of attention (..., P, R) and gamma's uniform one -> (..., P) in [0, 1]."""
+    return (attention - uniform_attention(gamma)).abs().sum(-1) / 2
+
+
+@torch.no_grad()
+def zero_shot_error(net: CrossAttention, columns: Columns, values: Tensor, target: Tensor) -> float:
+    """Root mean squared error of the zero-shot stream where some pixel falls: values (N, R, K), target (N, P, K)."""
+    error = net.zero(columns.features, values) - target
+    return float(error[columns.gamma.any(-1)].square().mean().sqrt())
+
+
+def _normal(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> nn.Parameter:
+    return nn.Parameter(torch.from_numpy(scale * rng.normal(size=shape)).float())
