@@ -1,4 +1,7 @@
-"""Predicted maps against true ones, for learned models and geometric baselines alike."""
+"""Predicted maps against true ones, for learned models and geometric baselines alike.
+
+As a command, `zerobev.learning.real_homes`: the shipped weights on a folder of homes.
+"""
 
 from collections.abc import Callable, Iterable, Mapping
 
@@ -46,3 +49,10 @@ def model_projector(model: nn.Module, device: torch.device | str) -> Projector:
 def model_inputs(batch: Batch) -> list[Tensor]:
     """What a model is called with: `rgb`, `zero`, and `depth` where the batch has it."""
     return [batch[name] for name in ("rgb", "zero", "depth") if name in batch]
+
+
+if __name__ == "__main__":
+    from zerobev.errors import run_command
+    from zerobev.learning.real_homes import main
+
+    run_command(main)
