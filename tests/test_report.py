@@ -21,7 +21,6 @@ from zerobev.report import (
     Checks,
     label_image,
     maps_image,
-    metric_extent,
     plan,
     scoreboard,
     table,
@@ -134,7 +133,7 @@ def test_plan_shows_a_home_in_world_metres():
     expected = np.where(y < 2, LABELS.index("floor"), NO_LABEL)
     expected[(x > 5) & (x < 6.5) & (y > -1) & (y < 1)] = LABELS.index("bed")
     assert (label != expected).mean() < 0.01
-    assert metric_extent(CameraConfig(fpv_px=4, bev_px=4)) == (-2.5, 2.5, 0.0, 5.0)
+    assert CameraConfig(fpv_px=4, bev_px=4).extent == (-2.5, 2.5, 0.0, 5.0)
 
 
 def test_checks_note_what_holds_and_stop_at_what_does_not():

@@ -44,6 +44,12 @@ class CameraConfig:
         """Side of a map cell, metres."""
         return self.bev_extent_m / self.bev_px
 
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """`extent` for `imshow` of a map: metres to the right of the camera, and in front of it."""
+        half = self.bev_extent_m / 2
+        return (-half, half, 0.0, self.bev_extent_m)
+
 
 @dataclass(frozen=True)
 class AgentConfig:

@@ -120,7 +120,7 @@ def averages_figure(number: int, records: Sequence[Record]) -> Figure:
             low, high = bootstrap_interval(counts, statistic, np.random.default_rng(0))
             mean = np.mean([one.value(statistic) for one in counts])
             axes.plot([100 * low, 100 * high], [y, y], color=COLORS[4], linewidth=3, alpha=0.5)
-            axes.plot(100 * mean, y, "o", color=COLORS[4], label="ours")
+            axes.plot(100 * mean, y, "o", color=COLORS[4])
             if (published := TABLES.get(number, {}).get(row)) is not None:
                 axes.plot(published.class_iou if name == "class" else published.pixel_iou, y, "x", color=COLORS[0])
         axes.set(xlabel=f"{name} IoU [%]", xlim=(0, None))
@@ -164,12 +164,6 @@ def add_legend(figure: Figure) -> None:
     """The eight classes and their colours, below a figure."""
     patches = [Patch(color=color, label=name) for name, color in zip(LABELS, COLORS)]
     figure.legend(handles=patches, loc="lower center", ncols=len(LABELS), fontsize=7, bbox_to_anchor=(0.5, -0.04))
-
-
-def metric_extent(camera: CameraConfig) -> tuple[float, float, float, float]:
-    """`extent` for `imshow` of a map, with metres on both axes."""
-    half = camera.bev_extent_m / 2
-    return (-half, half, 0.0, camera.bev_extent_m)
 
 
 def _rgb(color: str) -> np.ndarray:

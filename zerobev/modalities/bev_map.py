@@ -43,8 +43,7 @@ class BevMap:
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """`extent` for `imshow`: metres to the right of the camera, and in front of it."""
-        half = self.camera.bev_extent_m / 2
-        return (-half, half, 0.0, self.camera.bev_extent_m)
+        return self.camera.extent
 
     @property
     def centres_m(self) -> np.ndarray:
