@@ -11,7 +11,7 @@ from scenes_for_tests import REAL_HOMES, build, furnished
 
 from zerobev.config import LABELS, TextureConfig
 from zerobev.errors import InputError, run_command
-from zerobev.learning.evaluate import evaluate, model_projector
+from zerobev.learning.evaluate import evaluate, model_predictor
 from zerobev.learning.metrics import Counts
 from zerobev.learning.real_homes import METHODS, evaluate_homes, main
 from zerobev.models import load_model
@@ -47,7 +47,7 @@ def test_counts_are_those_of_recorded_shards(homes, counts, tmp_path):
     views = ViewSet([Shard(path, model.camera, TextureConfig()) for path in paths])
     recorded = {
         "a.1": lambda batch: project(batch["zero"], batch["depth"], model.camera) > 0,
-        ROWS[0]: model_projector(model, "cpu"),
+        ROWS[0]: model_predictor(model, "cpu"),
     }
     for row, projector in recorded.items():
         expected = evaluate(projector, semantic_batches(views, model.camera, 3), 2, len(LABELS))

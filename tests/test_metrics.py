@@ -11,7 +11,7 @@ from torch import nn
 from torchmetrics.classification import MultilabelJaccardIndex
 
 from zerobev.errors import InputError
-from zerobev.learning.evaluate import evaluate, model_projector
+from zerobev.learning.evaluate import evaluate, model_predictor
 from zerobev.learning.metrics import (
     Counts,
     bootstrap_interval,
@@ -159,7 +159,7 @@ def test_evaluate_thresholds_probabilities():
     assert undecided.intersection.sum() == 0, "a probability of exactly one half is no detection"
 
 
-def test_model_projector():
+def test_model_predictor():
     """A model is used in evaluation mode, without a graph, and gets the two images."""
 
     class Halved(nn.Module):
@@ -175,7 +175,7 @@ def test_model_projector():
 
     logits, whole, batches = batches_of(1)
     expected = count(logits > 0, whole["target"], whole["fov"], whole["scene"], 2)
-    assert evaluate(model_projector(Halved().train(), "cpu"), batches, 2, 3) == expected
+    assert evaluate(model_predictor(Halved().train(), "cpu"), batches, 2, 3) == expected
 
 
 def scenes_with(rng: np.random.Generator, mean: float, scenes: int = 40) -> Counts:

@@ -10,7 +10,7 @@ import torch
 from zerobev.config import LABELS, Scale
 from zerobev.experiments import EXPERIMENTS, Experiment
 from zerobev.gallery import gallery_indices
-from zerobev.learning.evaluate import Projector, evaluate, model_projector
+from zerobev.learning.evaluate import Predictor, evaluate, model_predictor
 from zerobev.learning.history import History
 from zerobev.learning.monitor import maps_figure
 from zerobev.learning.train import Source, dice_objective, train
@@ -92,17 +92,17 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     pretraining = DepthPretraining(workspace)
     history: History | None = None
     if experiment.network is None:
-        projector: Projector = _projection(workspace)
+        predict: Predictor = _projection(workspace)
         device = "cpu"
     else:
         model, history = train_run(experiment, workspace, seed, key)
         device = next(model.parameters()).device.type
-        projector = model_projector(model, device)
+        predict = model_predictor(model, device)
     predicted = experiment.reads_depth and experiment.test_depth == "predicted"
     test = pretraining.views("test") if predicted else workspace.views("test")
     trained = time.monotonic()
     batches = semantic_batches(test.first(workspace.scale.test_views), workspace.scale.camera, _EVALUATION_BATCH)
-    counts = evaluate(projector, batches, len(test.shards), len(LABELS))
+    counts = evaluate(predict, batches, len(test.shards), len(LABELS))
     record = Record(
         key=key,
         row=experiment.row,
@@ -120,14 +120,14 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     )
     batch = collate([semantic_sample(test, i, workspace.scale.camera) for i in gallery_indices(test)])
     with torch.inference_mode():
-        maps = projector(batch).cpu()
+        maps = predict(batch).cpu()
     store.write(record, ((maps if maps.dtype == torch.bool else maps > 0) & (batch["fov"] > 0.5)).numpy())
     # the record is complete: a later call for a fresh one starts from the first step
     (workspace.runs / key / "checkpoint.pt").unlink(missing_ok=True)
     return record
 
 
-def _projection(workspace: Workspace) -> Projector:
+def _projection(workspace: Workspace) -> Predictor:
     """Rows (a): P^-1 with the depth that the batch brings."""
     return lambda batch: project(batch["zero"], batch["depth"], workspace.scale.camera) > 0
 

@@ -12,38 +12,38 @@ from zerobev.learning.metrics import Counts, count
 
 Batch = Mapping[str, Tensor]
 #: From a batch to maps (B, K, M, M): floating-point logits, or booleans that are taken as they are.
-Projector = Callable[[Batch], Tensor]
+Predictor = Callable[[Batch], Tensor]
 
 
 def evaluate(
-    project: Projector, batches: Iterable[Batch], n_scenes: int, n_classes: int, threshold: float = 0.5
+    predict: Predictor, batches: Iterable[Batch], n_scenes: int, n_classes: int, threshold: float = 0.5
 ) -> Counts:
-    """Intersections and unions of the maps that `project` predicts, per test scene (paper, supplement, "Metrics").
+    """Intersections and unions of the maps of `predict`, per test scene (paper, supplement, "Metrics").
 
-    project: is called in inference mode; logits are passed through a sigmoid and thresholded (strictly above)
-    batches: each with what `project` needs, and `target` (B, K, M, M), `fov` (B, 1, M, M), `scene` (B,) below n_scenes
+    predict: is called in inference mode; logits are passed through a sigmoid and thresholded (strictly above)
+    batches: each with what `predict` needs, and `target` (B, K, M, M), `fov` (B, 1, M, M), `scene` (B,) below n_scenes
     n_classes: K
     """
     total = Counts.empty(n_scenes, n_classes)
     with torch.inference_mode():
         for batch in batches:
-            maps = project(batch).to(batch["target"].device)
+            maps = predict(batch).to(batch["target"].device)
             predicted = maps if maps.dtype == torch.bool else maps.float().sigmoid() > threshold
             total += count(predicted, batch["target"], batch["fov"], batch["scene"], n_scenes)
     return total
 
 
-def model_projector(model: nn.Module, device: torch.device | str) -> Projector:
-    """A learned model as a projector: moved to `device`, in evaluation mode, in float32.
+def model_predictor(model: nn.Module, device: torch.device | str) -> Predictor:
+    """A learned model as a predictor: moved to `device`, in evaluation mode, in float32.
 
     The model is called as `model(rgb, zero, depth)`, depth where the batch has it, and returns logits as `zero_logits`.
     """
     model = model.to(device).eval()
 
-    def project(batch: Batch) -> Tensor:
+    def predict(batch: Batch) -> Tensor:
         return model(*(image.to(device) for image in model_inputs(batch))).zero_logits
 
-    return project
+    return predict
 
 
 def model_inputs(batch: Batch) -> list[Tensor]:

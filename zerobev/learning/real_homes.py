@@ -9,7 +9,6 @@ import argparse
 import sys
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.errors import InputError
-from zerobev.learning.evaluate import Batch, evaluate
+from zerobev.learning.evaluate import Batch, Predictor, evaluate
 from zerobev.learning.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
 from zerobev.modalities.projector import GEOMETRIC, Projector, load
 from zerobev.progress import progress
@@ -70,7 +69,7 @@ def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict
     return {row: Counts(c.intersection[good], c.union[good]) for row, c in total.items()}, broken
 
 
-def _maps(row: str, projectors: dict[str, Projector]) -> Any:
+def _maps(row: str, projectors: dict[str, Projector]) -> Predictor:
     """What `learning.evaluate` takes for a row: from a batch to boolean maps."""
 
     def of(batch: Batch) -> Tensor:
