@@ -6,6 +6,7 @@ of its pixels on the map is known. Rows are projections: P^-1 with estimated dep
 
 import argparse
 import json
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from zerobev.errors import InputError, run_command
 from zerobev.modalities.flow import Flow, flow_field
 from zerobev.modalities.projector import GEOMETRIC, Projector, load
 from zerobev.progress import progress
-from zerobev.records import is_fresh
+from zerobev.records import git_revision, is_fresh, origin
 from zerobev.scenes.hm3dsem import find_scenes, read_scene
 from zerobev.scenes.homes import ensure_homes
 from zerobev.scenes.moving import movable, moved
@@ -161,11 +162,13 @@ def moving_pairs(folders: list[Path], count: int, seed: int) -> Iterator[MovingP
     for folder in progress(folders, "homes", "home", len(folders)):
         if found == count:
             return
+        scene = read_scene(folder)
         try:
-            yield moving_pair(read_scene(folder), camera, rng)
-            found += 1
-        except InputError:
+            pair = moving_pair(scene, camera, rng)
+        except InputError:  # nothing in it can be moved
             continue
+        yield pair
+        found += 1
 
 
 def recorded_motion(workspace: Workspace, count: int = 32) -> pd.DataFrame:
@@ -184,8 +187,10 @@ def recorded_motion(workspace: Workspace, count: int = 32) -> pd.DataFrame:
             raise InputError(f"{path}: expected a record of motion, found {error}") from None
     homes = workspace.split.test
     ensure_homes(list(homes), workspace.scale.scenes.seed, 1)
+    revision, started = git_revision(), time.monotonic()
     errors = evaluate_motion(moving_pairs(list(homes), count, seed=0))
-    write_json(path, {"weights": weights, "pairs": count, "errors": errors.to_dict(orient="list")})
+    made = {"origin": origin("cpu", revision), "seconds": round(time.monotonic() - started, 1)}
+    write_json(path, {"weights": weights, "pairs": count, **made, "errors": errors.to_dict(orient="list")})
     return errors
 
 
