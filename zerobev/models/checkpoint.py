@@ -58,6 +58,11 @@ class BevModel(nn.Module):
                 raise InputError(f"{name}: expected {expected}, found {found}")
         return batch
 
+    def check_inputs(self, rgb: Tensor, zero: Tensor, depth: Tensor | None) -> None:
+        """`check` of what a zero-shot network is called with; depth counts in the residual variants alone."""
+        read = {"depth": (depth, 1)} if self.config.residual else {}
+        self.check(rgb=(rgb, 3), zero=(zero, None), **read)
+
     def save(self, path: Path) -> None:
         """Write one safetensors file: the weights, with the class and configuration as JSON in its metadata."""
         described = {"class": type(self).__name__, "camera": asdict(self.camera), "model": asdict(self.config)}

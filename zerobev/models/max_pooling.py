@@ -95,10 +95,7 @@ class MaxPoolZeroBEV(BevModel):
 
         depth: (B, 1, H, W) metres, true or estimated; the residual variant alone reads it
         """
-        if self.config.residual:
-            self.check(rgb=(rgb, 3), zero=(zero, None), depth=(depth, 1))
-        else:
-            self.check(rgb=(rgb, 3), zero=(zero, None))
+        self.check_inputs(rgb, zero, depth)
         (features,) = self.pyramid(self.backbone(rgb))
         gates = self.gates(features)
         pooled = noisy_or(gates, zero.permute(0, 3, 2, 1))  # B W P K

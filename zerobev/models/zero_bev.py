@@ -44,12 +44,10 @@ class ZeroBEV(BevModel):
 
         depth: (B, 1, H, W) metres, true or estimated; the residual variant alone reads it
         """
+        self.check_inputs(rgb, zero, depth)
         images = [zero]  # and what else belongs to each of them
         if self.config.residual:
-            self.check(rgb=(rgb, 3), zero=(zero, None), depth=(depth, 1))
             images.append(project(zero, depth, self.camera))
-        else:
-            self.check(rgb=(rgb, 3), zero=(zero, None))
         rgb_maps = self.backbone(rgb)
         parts = zip(*(image.split(max(1, IMAGES_A_PASS // len(zero)), dim=1) for image in images))
         logits = torch.cat([self.pass_images(rgb_maps, *part) for part in parts], dim=1)  # B K 1+aux M M
