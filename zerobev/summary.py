@@ -28,7 +28,7 @@ from zerobev.gallery import gallery
 from zerobev.paper import CLAIMS, RATIOS
 from zerobev.records import Record, RecordStore
 from zerobev.report import averages_figure, cost_table, gallery_figure, table
-from zerobev.runs import recorded
+from zerobev.runs import SEEDS, recorded
 from zerobev.storage import replacing, write_json
 from zerobev.workspace import Workspace
 
@@ -49,7 +49,7 @@ h1, h2 { line-height: 1.2 } h2 { margin-top: 2em; border-bottom: 1px solid #ccc 
 table { border-collapse: collapse; font-size: 13px; margin: 1em 0; display: block; overflow-x: auto }
 th, td { padding: .25em .6em; border-bottom: 1px solid #e5e5e5; text-align: right; white-space: nowrap }
 th:first-child, td.text, th.text { text-align: left; white-space: normal }
-tr.ours td { background: #eef4fb } tr.best td { font-weight: 600 }
+tr.ours td { background: #eef4fb }
 .holds { color: #1b7837 } .does-not-hold { color: #b2182b } .undecided { color: #946a00 } .not-run { color: #888 }
 img { max-width: 100%; display: block; margin: 1em 0 }
 """
@@ -75,7 +75,12 @@ def write_summary(workspace: Workspace) -> Path:
             sections.append(
                 _picture(averages_figure(number, mine), folder, f"table{number}", "Averages, 90 % intervals")
             )
-    sections += ["<h2>What it looks like</h2>", _gallery(workspace, records), "<h2>Runs</h2>", _costs(records)]
+    sections += [
+        "<h2>What it looks like</h2>",
+        _gallery(workspace, records),
+        "<h2>Runs</h2>",
+        cost_table(records).to_html(border=0),
+    ]
     page = folder / "index.html"
     with replacing(page) as temporary:
         temporary.write_text(_page(workspace, records, sections), encoding="utf-8")
@@ -143,16 +148,12 @@ def _ratios(ratios: Sequence[dict[str, str | float | None]]) -> str:
 
 def _gallery(workspace: Workspace, records: Sequence[Record]) -> str:
     store = RecordStore(workspace.reports)
-    maps = {record.row: store.maps(record.key) for record in reversed(records) if record.row in _SHOWN}
-    if not maps:
+    keys = {record.row: record.key for record in records if record.seed == SEEDS[0]}
+    shown = {row: store.maps(keys[row]) for row in _SHOWN if row in keys}
+    if not shown:
         return "<p>No row is recorded.</p>"
-    shown = {row: maps[row] for row in _SHOWN if row in maps}
     figure = gallery_figure(gallery(workspace), shown)
     return _picture(figure, workspace.reports, "gallery", "Eight views of test homes, spread evenly")
-
-
-def _costs(records: Sequence[Record]) -> str:
-    return cost_table(records).to_html(border=0)
 
 
 def _picture(figure: Figure, folder: Path, name: str, text: str) -> str:
