@@ -17,7 +17,7 @@ class Experiment:
     share: float = 0.20  #: of white texels (Synth)
     scales: tuple[float, float] | None = None  #: see `TextureConfig.scales`; None: those of the scale
     fresh: bool = True  #: a new texture for every sample; else one a scene, as in the paper
-    paper_start: bool = False  #: train as the paper does where this scale's short schedule makes us differ
+    paper_start: bool = False  #: no blank samples, first weights without `ground_start` and gains: as in the paper
     train_depth: tuple[str, ...] = ("gt",)  #: "gt" or "predicted", one stage of training after the other
     test_depth: str = "predicted"  #: what P^-1 and the residual model get in the test
 

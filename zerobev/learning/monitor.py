@@ -35,6 +35,8 @@ def curves_figure(curves: Mapping[str, Sequence[float | None]]) -> Figure:
 def maps_figure(model: nn.Module, batch: Mapping[str, Tensor]) -> Figure:
     """Samples of a batch, one a line: photograph, zero-shot image, predicted map, true map; of the first modality.
 
+    It is drawn without `report.grid` and its pyplot, which would show it in the notebook that trains.
+
     model: returns a `Projection`; it is called as it is, in evaluation mode
     batch: of `streams.tuples`, on the model's device
     """
