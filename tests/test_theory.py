@@ -11,9 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize
 
+from zerobev import config
 from zerobev.config import CameraConfig
+from zerobev.models.band_transformer import BandAttention
 from zerobev.models.fpv_to_bev import columns, reweigh
+from zerobev.models.polar import band_rows
+from zerobev.models.variants import build
 from zerobev.streams.projection import cells_of_pixels
+from zerobev.theory.attended import attended, column_attention
 from zerobev.theory.attention import CrossAttention, divergence, total_variation, train, zero_shot_error
 from zerobev.theory.correspondence import (
     Columns,
@@ -215,3 +220,68 @@ def test_the_worst_case_is_the_minimax(inside):
     one = np.append(np.ones(inside), 0.0)[None]
     convex = linprog(objective, rows, limits, A_eq=one, b_eq=[1.0], bounds=[(0, None)] * (inside + 1))
     assert convex.fun == pytest.approx(worst_case_attention(inside), abs=1e-9)
+
+
+# --- attention of a trained network
+
+
+def looking_at(position: torch.Tensor, rows: range, stride: int, wanted: torch.Tensor) -> torch.Tensor:
+    """An attention of one head that looks at a feature over a wanted pixel of its position, and else at the top row.
+
+    position: (H, W); wanted: (H, W) bool, pixels it looks at for positions that no pixel falls into
+    """
+    size = -(-position.shape[0] // stride)
+    weights = torch.zeros(size, 1, len(rows), size)
+    for column, (p, row) in product(range(size), enumerate(rows)):
+        part = slice(column * stride, (column + 1) * stride)
+        falls = (position[:, part] == row).any(1)
+        chosen = falls if falls.any() else wanted[:, part].any(1)
+        weights[column, 0, p, int(chosen.nonzero()[0, 0]) // stride if chosen.any() else 0] = 1
+    return weights
+
+
+@pytest.mark.parametrize("knows_depth", (True, False))
+def test_attention_is_measured_where_cells_are_seen_raised_or_hidden(knows_depth, monkeypatch):
+    scale = replace(config.scale("smoke"), camera=CameraConfig(fpv_px=32, bev_px=20))
+    net = build("c", scale.camera, replace(scale.model, heads=1))
+    # a level floor up to 4 m with a box on it that stands at 2 m in the left half and hides the floor behind
+    depth = flat_floor(scale.camera).clamp(max=4.0)
+    floor = depth < 4.0
+    box = (torch.arange(32)[:, None] >= 8) & (torch.arange(32) < 16) & (depth > 2.0)
+    depth, floor = torch.where(box, 2.0, depth), floor & ~box
+    position = positions(depth, scale.camera)
+    bands = [
+        BandAttention([], [], [looking_at(position if knows_depth else position.flip(0), rows, stride, floor)])
+        for rows, stride in zip(band_rows(scale.camera, scale.model.band_edges_m), (16, 8, 4, 2))
+    ]
+    monkeypatch.setattr(net, "attention", lambda *_: bands)
+    found = attended(net, torch.zeros(1, 3, 32, 32), torch.zeros(1, 1, 32, 32), depth[None], floor[None])
+    share = found["share"].unstack("cells are").droplevel("head")
+    cells = found["cells"].unstack("cells are").droplevel("head")
+    if knows_depth:
+        assert (share.stack().dropna() == 1).all() and share.loc[2].notna().all()
+    else:
+        assert share.loc[1:, "floor"].max() < 0.5
+    # what the box hides: floor behind it, in its columns alone, farther than 2 m and nearer than the wall at 4 m
+    assert cells["hidden"].tolist()[:2] == [0, 0] and cells["hidden"].sum() > 0
+    assert cells["raised"].sum() > 0 and cells.loc[0, "floor"] == 0  # nearer floor is below the image
+
+
+def flat_floor(camera: CameraConfig) -> torch.Tensor:
+    """Planar depth (H, W) of a level floor, 50 m above the horizon."""
+    below = (torch.arange(camera.fpv_px) + 0.5 - camera.fpv_px / 2).clamp(min=1e-3)
+    depth = camera.focal_px * camera.height_m / below
+    return depth.clamp(max=50.0)[:, None].expand(-1, camera.fpv_px).contiguous()
+
+
+def test_a_column_of_attention_is_a_distribution_over_image_rows():
+    scale = config.scale("smoke")
+    net = build("c", scale.camera, scale.model).eval()
+    rgb, zero = torch.rand(1, 3, 32, 32), torch.rand(1, 1, 32, 32)
+    columns_of_attention = [column_attention(net, rgb, zero, column) for column in (0, 1, 16)]
+    for weights in columns_of_attention:
+        assert weights.shape == (scale.model.heads, 20, 32)
+        torch.testing.assert_close(weights.sum(-1), torch.ones(weights.shape[:2]))
+    assert torch.equal(columns_of_attention[0], columns_of_attention[1])  # under one feature, at every stride
+    far = net.attention(rgb, zero)[-1].cross[-1]  # (16, heads, P, 16): the finest map feeds the farthest band
+    torch.testing.assert_close(columns_of_attention[2][:, 0, ::2] * 2, far[8, :, 0])

@@ -9,7 +9,9 @@ import os
 import platform
 import resource
 import subprocess
+import time
 import zlib
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -100,6 +102,26 @@ class RecordStore:
 
     def _maps_path(self, key: str) -> Path:
         return self._gallery / f"{key}.npz"
+
+
+def kept(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `compute` makes of `identity`: read from `path` where it is recorded there, else computed and recorded.
+
+    identity: all that the result depends on, plain data; a record of another identity is replaced
+    Raises `InputError` for a file that is no such record.
+    """
+    if path.exists() and is_fresh(path):
+        try:
+            found = json.loads(path.read_text())
+            if found["identity"] == identity:
+                return found["result"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: expected a record, found {error!r}") from None
+    revision, started = git_revision(), time.monotonic()
+    result = compute()
+    made = {"origin": origin("cpu", revision), "seconds": round(time.monotonic() - started, 1)}
+    write_json(path, {"identity": identity, **made, "result": result})
+    return result
 
 
 def is_fresh(path: Path) -> bool:

@@ -39,6 +39,11 @@ def run_of(path: Path) -> str:
         return json.loads(file.metadata()["zerobev"])["run"]
 
 
+def shipped_runs() -> dict[str, str]:
+    """Name of the recorded run that each shipped file comes from."""
+    return {name: run_of(shipped(name)) for name in (*ROWS, DEPTH)}
+
+
 def halve(source: Path, target: Path, run: str) -> None:
     """Write the checkpoint `source` to `target` in half precision, with the name of its run.
 

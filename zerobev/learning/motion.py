@@ -5,10 +5,8 @@ of its pixels on the map is known. Rows are projections: P^-1 with estimated dep
 """
 
 import argparse
-import json
-import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,7 @@ from zerobev.errors import InputError, run_command
 from zerobev.modalities.flow import Flow, flow_field
 from zerobev.modalities.projector import GEOMETRIC, Projector, load
 from zerobev.progress import progress
-from zerobev.records import git_revision, is_fresh, origin
+from zerobev.records import kept
 from zerobev.scenes.hm3dsem import find_scenes, read_scene
 from zerobev.scenes.homes import ensure_homes
 from zerobev.scenes.moving import movable, moved
@@ -31,7 +29,7 @@ from zerobev.sensors.photograph import Photographer
 from zerobev.sensors.poses import navigable_floor
 from zerobev.storage import write_json
 from zerobev.streams.projection import map_points
-from zerobev.weights import DEPTH, ROWS, run_of, shipped
+from zerobev.weights import ROWS, shipped_runs
 from zerobev.workspace import Workspace
 
 #: Side of the photographs: flow needs finer ones than the networks do.
@@ -176,22 +174,14 @@ def recorded_motion(workspace: Workspace, count: int = 32) -> pd.DataFrame:
 
     The record `motion.json` of the report names the weights that it is of; those of other weights are computed again.
     """
-    path = workspace.reports / "motion.json"
-    weights = {name: run_of(shipped(name)) for name in (*ROWS, DEPTH)}
-    if path.exists() and is_fresh(path):
-        try:
-            found = json.loads(path.read_text())
-            if (found["weights"], found["pairs"]) == (weights, count):
-                return pd.DataFrame(found["errors"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: expected a record of motion, found {error}") from None
-    homes = workspace.split.test
-    ensure_homes(list(homes), workspace.scale.scenes.seed, 1)
-    revision, started = git_revision(), time.monotonic()
-    errors = evaluate_motion(moving_pairs(list(homes), count, seed=0))
-    made = {"origin": origin("cpu", revision), "seconds": round(time.monotonic() - started, 1)}
-    write_json(path, {"weights": weights, "pairs": count, **made, "errors": errors.to_dict(orient="list")})
-    return errors
+    homes = list(workspace.split.test)
+
+    def compute() -> dict[str, list]:
+        ensure_homes(homes, workspace.scale.scenes.seed, 1)
+        return evaluate_motion(moving_pairs(homes, count, seed=0)).to_dict(orient="list")
+
+    identity = {"weights": shipped_runs(), "pairs": count, "scenes": asdict(workspace.scale.scenes)}
+    return pd.DataFrame(kept(workspace.reports / "motion.json", identity, compute))
 
 
 def main() -> None:

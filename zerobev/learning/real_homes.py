@@ -17,9 +17,9 @@ from torch import Tensor
 
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.errors import InputError
-from zerobev.learning.evaluate import Batch, Predictor, evaluate
+from zerobev.learning.evaluate import Predictor, evaluate
 from zerobev.learning.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
-from zerobev.modalities.projector import GEOMETRIC, Projector, load
+from zerobev.modalities.projector import GEOMETRIC, load
 from zerobev.progress import progress
 from zerobev.scenes.hm3dsem import find_scenes, read_scene
 from zerobev.storage import write_json
@@ -53,6 +53,8 @@ def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict
         raise InputError(f"views: expected 1 or more, found {views}")
     projectors = {row: load(row) for row in (GEOMETRIC, *ROWS)}
     camera = projectors[GEOMETRIC].camera
+    methods: dict[str, Predictor] = {ORACLE: lambda batch: project(batch["zero"], batch["depth"], camera) > 0}
+    methods |= {row: projector.predict for row, projector in projectors.items()}
     total = {row: Counts.empty(len(folders), len(LABELS)) for row in METHODS}
     broken: dict[str, str] = {}
     for number, folder in enumerate(progress(folders, "homes", "home", len(folders))):
@@ -61,24 +63,12 @@ def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict
         except InputError as error:
             broken[folder.name] = str(error)
             continue
-        for row in METHODS:
-            total[row] += evaluate(_maps(row, projectors), [batch], len(folders), len(LABELS))
+        for row, predict in methods.items():
+            total[row] += evaluate(predict, [batch], len(folders), len(LABELS))
     if len(broken) == len(folders):
         raise InputError("; ".join(broken.values()))
     good = [number for number, folder in enumerate(folders) if folder.name not in broken]
     return {row: Counts(c.intersection[good], c.union[good]) for row, c in total.items()}, broken
-
-
-def _maps(row: str, projectors: dict[str, Projector]) -> Predictor:
-    """What `learning.evaluate` takes for a row: from a batch to boolean maps."""
-
-    def of(batch: Batch) -> Tensor:
-        if row == ORACLE:
-            return project(batch["zero"], batch["depth"], projectors[GEOMETRIC].camera) > 0
-        projector = projectors[row]
-        return projector.probabilities(batch["rgb"], batch["zero"], projector.estimator(batch["rgb"])) > 0.5
-
-    return of
 
 
 def results_table(counts: dict[str, Counts]) -> pd.DataFrame:

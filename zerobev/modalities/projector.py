@@ -1,5 +1,6 @@
 """The trained networks, ready for use: `zerobev.load().project(rgb, modality)`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,11 +104,15 @@ class Projector:
         logits = self.network(rgb, with_empty, depth).zero_logits[0]
         return logits[:-1].sigmoid(), (logits[:-1] - logits[-1]).clamp(min=0)
 
-    def probabilities(self, rgb: Tensor, zero: Tensor, depth: Tensor) -> Tensor:
-        """Batches as the networks take them, (B, 3, S, S), (B, K, S, S), (B, 1, S, S) -> (B, K, M, M) in [0, 1]."""
+    def predict(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """A batch of `streams.tuples` -> maps (B, K, M, M) bool, as `learning.evaluate` takes them.
+
+        Depth is estimated; the batch's own, which is true, is not read.
+        """
+        depth = self.estimator(batch["rgb"])
         if self.network is None:
-            return project(zero, depth, self.camera)
-        return self.network(rgb, zero, depth).zero_logits.sigmoid()
+            return project(batch["zero"], depth, self.camera) > 0.5
+        return self.network(batch["rgb"], batch["zero"], depth).zero_logits > 0
 
 
 def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None) -> Projector:
