@@ -51,6 +51,21 @@ def inputs(batch: int, k: int = CLASSES, side: int = 32) -> tuple[Tensor, Tensor
     return torch.rand(batch, 3, side, side), zero, 0.3 + 5 * torch.rand(batch, 1, side, side)
 
 
+@pytest.mark.parametrize("row", ROWS)
+def test_maps_start_from_their_prior_and_auxiliary_maps_from_one_half(row):
+    """A prior shifts the logits of what is projected, by as much as its own logit, and nothing else."""
+    rgb, zero, depth = inputs(2)
+    results = []
+    for prior in (0.5, 0.1):
+        torch.manual_seed(0)
+        with torch.no_grad():
+            results.append(network(row, prior=prior)(rgb, zero, depth))
+    shift = torch.full_like(results[0].zero_logits, float(np.log(0.1 / 0.9)))
+    assert torch.allclose(results[1].zero_logits - results[0].zero_logits, shift, atol=1e-5)
+    if results[0].aux_logits is not None:
+        assert torch.equal(results[0].aux_logits, results[1].aux_logits)
+
+
 def views(n: int, camera: CameraConfig) -> dict[str, Tensor]:
     """A batch of `n` views of a floor of coloured squares in front of a wall, cast by hand; the colour is the class.
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.errors import InputError
-from zerobev.streams.projection import project
+from zerobev.streams.projection import cells_of_pixels, map_points, project
 from zerobev.streams.shards import Shard, write_shard
 from zerobev.streams.textures import MODSEM_DRAWS, TextureBank
 from zerobev.streams.tuples import (
@@ -22,6 +22,7 @@ from zerobev.streams.tuples import (
     TupleStream,
     ViewSet,
     collate,
+    painted_from_above,
     semantic_batches,
     semantic_sample,
     view_sample,
@@ -332,3 +333,51 @@ def test_auxiliary_maps_of_a_room(views):
         surface = view.bev_texel[..., 0] >= 0
         assert np.array_equal(obstacles + navigable, surface)
         assert np.array_equal(obstacles > 0, np.isin(view.bev_instance, (7, 8, 9, 11)))
+
+
+def test_what_is_painted_from_above_wears_the_plan_all_along_the_vertical(views):
+    seen = 0
+    for index in range(len(views)):
+        shard, view = views.locate(index)
+        chart = views.shards[shard].charts
+        fpv, bev = painted_from_above(view, CAMERA, chart)
+        raised = bev[..., 0] == chart
+        assert np.array_equal(raised, (view.bev_texel[..., 0] >= 0) & (view.bev_height > CAMERA.obstacle_m))
+        assert np.array_equal(bev[~raised], view.bev_texel[~raised])
+        height = map_points(torch.from_numpy(view.depth), CAMERA)[..., 2].numpy()
+        painted = fpv[..., 0] == chart
+        assert np.array_equal(fpv[~painted], view.fpv_texel[~painted])
+        assert not painted[(height > CAMERA.max_height_m) | (height < CAMERA.obstacle_m)].any()
+        # a raised pixel wears what its cell wears, up to the size of a cell, whatever its height
+        cell = cells_of_pixels(torch.from_numpy(view.depth), CAMERA).numpy()
+        both = painted & (cell < 20**2)
+        both[both] = raised.ravel()[cell[both]]
+        apart = fpv[both][:, 1:].astype(int) - bev.reshape(-1, 3)[cell[both]][:, 1:]
+        assert (np.linalg.norm(apart, axis=1) <= 100 * CAMERA.cell_m / 2**0.5 + 2).all()
+        seen += both.sum()
+    assert seen > 100
+
+
+def test_a_plan_belongs_to_the_world_and_not_to_the_camera(views):
+    _, view = views.locate(0)
+    x, y, z, yaw = view.pose
+    turned = painted_from_above(replace(view, pose=np.array([x, y, z, yaw + np.pi / 2])), CAMERA, 9)[1]
+    moved = painted_from_above(replace(view, pose=np.array([x + 3, y - 2, z, yaw])), CAMERA, 9)[1]
+    bev = painted_from_above(view, CAMERA, 9)[1]
+    raised = bev[..., 0] == 9
+    assert np.abs(moved[raised][:, 1:].astype(int) - bev[raised][:, 1:] - (300, -200)).max() <= 1
+    first, last = np.argwhere(raised)[[0, -1]]
+    along, after = (t[tuple(last)][1:].astype(int) - t[tuple(first)][1:] for t in (bev, turned))
+    assert np.abs(after - (-along[1], along[0])).max() <= 2  # a quarter turn of the camera turns the plan
+
+
+def test_the_asked_share_of_samples_is_painted_from_above(views, bank):
+    plain, upright = (SynthTuples(views, bank, CAMERA, 1, 6, upright=share) for share in (0.0, 0.4))
+    changed = [not np.array_equal(plain.sample(i)["zero"], upright.sample(i)["zero"]) for i in range(200)]
+    assert 0.3 < np.mean(changed) < 0.5
+    kept = SynthTuples(views, bank, CAMERA, 1, 6, fresh=False, upright=0.5)  # with one texture a scene, by scene
+    maps = {}
+    for i in range(40):
+        view = views_of_samples(views, [kept.sample(i)])[0]
+        maps.setdefault(view.rgb.tobytes(), set()).add(kept.sample(i)["target"].tobytes())
+    assert all(len(found) == 1 for found in maps.values())

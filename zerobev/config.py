@@ -110,6 +110,7 @@ class ModelConfig:
     ground_start: bool = False  #: rays begin by looking at the image row where the floor is seen (not in the paper)
     zero_gain: float = 1.0  #: factor on the first weights of the zero-shot stream's CNN
     residual_gain: float = 1.0  #: factor on the first weights of the residual's embedding
+    prior: float = 0.5  #: probability of white that maps start from
     band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
@@ -144,6 +145,8 @@ class Scale:
     depth: TrainConfig  #: of the depth estimator
     texture: TextureConfig = field(default_factory=TextureConfig)
     blank: float = 0.0  #: share of the samples whose zero-shot image, and its map, are made empty (not in the paper)
+    #: share of the *Synth* samples in which all that is raised is painted from above (not in the paper)
+    upright: float = 0.0
     test_views: int | None = None  #: of each test scene, the first ones, that networks are evaluated on; None: all
     #: first weights of the RGB backbones, as `models.weights.load_backbone` takes them; empty: the depth estimator's
     backbone: str = ""
@@ -197,6 +200,7 @@ SCALES = {
                 ground_start=True,
                 zero_gain=4.0,
                 residual_gain=6.0,
+                prior=0.1,
             ),
             train=TrainConfig(
                 steps=600,

@@ -17,7 +17,8 @@ class Experiment:
     share: float = 0.20  #: of white texels (Synth)
     scales: tuple[float, float] | None = None  #: see `TextureConfig.scales`; None: those of the scale
     fresh: bool = True  #: a new texture for every sample; else one a scene, as in the paper
-    paper_start: bool = False  #: no blank samples, first weights without `ground_start` and gains: as in the paper
+    upright: float | None = None  #: see `Scale.upright`; None: that of the scale
+    paper_start: bool = False  #: as in the paper: no blank samples, nothing painted from above, plain first weights
     train_depth: tuple[str, ...] = ("gt",)  #: "gt" or "predicted", one stage of training after the other
     test_depth: str = "predicted"  #: what P^-1 and the residual model get in the test
 
@@ -32,8 +33,14 @@ class Experiment:
 
     def model(self, scale: Scale) -> ModelConfig:
         """The network's configuration; its variant is not yet part of it."""
-        plain = {"ground_start": False, "zero_gain": 1.0, "residual_gain": 1.0}
+        plain = {"ground_start": False, "zero_gain": 1.0, "residual_gain": 1.0, "prior": 0.5}
         return replace(scale.model, **plain) if self.paper_start else scale.model
+
+    def upright_share(self, scale: Scale) -> float:
+        """The share of samples in which all that is raised is painted from above."""
+        if self.upright is not None:
+            return self.upright
+        return 0.0 if self.paper_start else scale.upright
 
     def blank(self, scale: Scale) -> float:
         """The share of blank samples. The masks of the classes need none: many are empty."""

@@ -81,7 +81,8 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
     if experiment.network is not None:
         texture = workspace.texture_identity(experiment.texture(scale))
         config |= {"model": asdict(experiment.model(scale)), "backbone": _backbone(experiment, scale)}
-        config |= {"train": asdict(scale.train), "texture": texture, "blank": experiment.blank(scale)}
+        config |= {"train": asdict(scale.train), "texture": texture}
+        config |= {"blank": experiment.blank(scale), "upright": experiment.upright_share(scale)}
     return config
 
 
@@ -168,7 +169,8 @@ def stream(experiment: Experiment, workspace: Workspace, part: str, depth: str, 
     scale = workspace.scale
     common = (scale.camera, seed, scale.train.batch, experiment.blank(scale))
     if experiment.stream == "synth":
-        return SynthTuples(views, workspace.bank(experiment.texture(scale)), *common, experiment.fresh)
+        bank = workspace.bank(experiment.texture(scale))
+        return SynthTuples(views, bank, *common, experiment.fresh, experiment.upright_share(scale))
     return {"modsem": ModSemTuples, "depthproj": DepthProjTuples, "classes": SemanticTuples}[experiment.stream](
         views, *common
     )

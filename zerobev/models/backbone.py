@@ -60,6 +60,7 @@ class RgbEncoder(nn.Module):
         self.network = resnet(3, model.stem_channels, model.channels, model.depths, model.block, max_pool)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+        self.to(memory_format=torch.channels_last)  # all maps follow, which saves a fifth of a step on a CPU
 
     def forward(self, rgb: Tensor) -> tuple[Tensor, ...]:
         """(B, 3, H, W) float32 in [0, 1] -> maps (B, channels[b], R_b, C_b), finest first."""
@@ -87,6 +88,7 @@ class ZeroCNN(nn.Module):
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
             self.layers[0].weight.mul_(gain)
+        self.to(memory_format=torch.channels_last)
 
     def forward(self, zero: Tensor) -> list[Tensor]:
         """(N, in_channels, H, W) -> maps (N, channels[b], ceil(H / stride_b), ceil(W / stride_b)), finest first."""

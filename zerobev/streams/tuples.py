@@ -14,7 +14,8 @@ import torch
 
 from zerobev.config import LABELS, CameraConfig
 from zerobev.errors import InputError
-from zerobev.streams.projection import project
+from zerobev.sensors.cameras import Pose, bev_cell_centres
+from zerobev.streams.projection import map_points, project
 from zerobev.streams.shards import Shard
 from zerobev.streams.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.streams.views import View
@@ -22,6 +23,8 @@ from zerobev.streams.views import View
 Sample = dict[str, np.ndarray]
 #: The images of K modalities in FPV (K, H, H) and the same on the map (K, M, M), bool or float.
 Pair = tuple[np.ndarray, np.ndarray]
+#: Texels of 1 cm, as many as int16 has, after which a plan repeats; the world's origin is in the middle.
+_PLAN_TEXELS = 2**15
 
 
 class ViewSet:
@@ -127,6 +130,11 @@ class SynthTuples(TupleStream):
 
     With `fresh=False` the texture of a scene, its scale included, is a function of (seed, scene), the same in all
     epochs. Scales are drawn between `bank.config.scales`.
+
+    upright: share of the samples, or of the scenes, in which all that is raised is painted from above. On a mesh that
+        is painted all around, what the map shows of a wall or a shelf is its upper side, which the camera does not see:
+        the texture of its front says nothing of it. Classes and most other modalities do not change along the
+        vertical; a training of a few hundred steps learns from such samples where upright surfaces are.
     """
 
     def __init__(
@@ -138,18 +146,46 @@ class SynthTuples(TupleStream):
         batch: int,
         blank: float = 0.0,
         fresh: bool = True,
+        upright: float = 0.0,
     ) -> None:
         super().__init__(views, camera, seed, batch, blank)
         self._bank = bank
         self._fresh = fresh
+        self._upright = upright
 
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
         """The texture on the surfaces as both sensors see it."""
         shard = self._views.shards[scene]
         if not self._fresh:
             rng = np.random.default_rng([self._seed, 2, scene])
-        draw = self._bank.draw(rng, shard.charts)
-        return self._bank.look_up(view.fpv_texel, draw)[None], self._bank.look_up(view.bev_texel, draw)[None]
+        draw = self._bank.draw(rng, shard.charts + 1)  # the last one is worn by what is painted from above
+        texels = view.fpv_texel, view.bev_texel
+        if rng.random() < self._upright:
+            texels = painted_from_above(view, self._camera, shard.charts)
+        return tuple(self._bank.look_up(image, draw)[None] for image in texels)
+
+
+def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np.ndarray, np.ndarray]:
+    """The texels of a view, (H, H, 3) and (M, M, 3) int16, with one chart more: the plan, in centimetres of the world.
+
+    It takes the place of all that is raised, so that a texture of it is the same all along the vertical. The image's
+    surfaces above `max_height_m` stay what they are: below a ceiling is something else.
+    """
+    pose = Pose(*view.pose)
+    points = map_points(torch.from_numpy(view.depth), camera).numpy()
+    under_ceiling = np.where(points[..., 2] < camera.max_height_m, points[..., 2], 0)
+    images = (
+        (view.fpv_texel, points[..., :2], under_ceiling),
+        (view.bev_texel, np.stack(bev_cell_centres(camera), axis=-1), view.bev_height),
+    )
+    painted = []
+    for texel, place, height in images:
+        raised = (texel[..., 0] >= 0) & (height > camera.obstacle_m)
+        world = place @ pose.world_R_map[:2, :2].T + (pose.x, pose.y)
+        plan = np.floor(100 * world[raised] + _PLAN_TEXELS / 2) % _PLAN_TEXELS
+        painted.append(texel.copy())
+        painted[-1][raised] = np.column_stack([np.full(len(plan), chart), plan])
+    return tuple(painted)
 
 
 class ModSemTuples(TupleStream):
