@@ -77,8 +77,10 @@ def _experiments() -> dict[str, Experiment]:
         # Table 5
         Experiment("c.modsem", stream="modsem"),
         Experiment("c.depthproj", stream="depthproj"),
-        # beyond the paper: how large structures are, how often they change, and the paper's choice in all we differ in
+        # beyond the paper: how large structures are, what they are painted on, how often they change, and the paper's
+        # choice in all we differ in
         Experiment("c.fixed", scales=(1.0, 1.0)),
+        Experiment("c.mesh", upright=0.0),
         Experiment("c.once", fresh=False),
         Experiment("c.paper", scales=(1.0, 1.0), fresh=False, paper_start=True),
     )
