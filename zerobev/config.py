@@ -211,9 +211,10 @@ SCALES = {
                 warmup=30,
             ),
             depth=TrainConfig(steps=8000, learning_rate=4e-3, decay_every=220, validate_every=1000, warmup=50),
-            texture=TextureConfig(scales=(0.25, 1.0)),
+            texture=TextureConfig(scales=(0.5, 1.0)),
             blank=0.2,
-            test_views=40,
+            upright=0.75,
+            test_views=24,
         ),
         Scale(
             name="paper",
