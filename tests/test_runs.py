@@ -67,7 +67,7 @@ def test_a_record_is_read_and_not_computed_again_until_a_fresh_one_is_asked_for(
 def test_every_row_of_every_table_is_a_run_and_each_run_is_one_row():
     rows = [row for table in TABLES.values() for row in table]
     assert set(rows) <= set(EXPERIMENTS)
-    own = {"f", "f.r", "c.fixed", "c.once", "c.paper"}
+    own = {"f", "f.r", "c.fixed", "c.mesh", "c.once", "c.paper"}
     assert {row for row in EXPERIMENTS if row not in rows} == own
     trained = [e for e in EXPERIMENTS.values() if e.network]
     assert len({replace(e, row="") for e in EXPERIMENTS.values()}) == len(EXPERIMENTS)
@@ -122,6 +122,9 @@ def test_the_papers_choices_are_one_row_away_from_ours(workspace):
     assert EXPERIMENTS["c.paper"].texture(reduced).scales == (1.0, 1.0) != EXPERIMENTS["c"].texture(reduced).scales
     blank = {row: EXPERIMENTS[row].blank(reduced) for row in ("c", "c.paper", "b.2")}
     assert blank["c"] > 0 == blank["c.paper"] == blank["b.2"]
+    upright = {row: EXPERIMENTS[row].upright_share(reduced) for row in ("c", "c.paper", "c.mesh")}
+    assert upright["c"] > 0 == upright["c.paper"] == upright["c.mesh"]
+    assert EXPERIMENTS["c"].model(reduced).prior < 0.5 == EXPERIMENTS["c.paper"].model(reduced).prior
     assert EXPERIMENTS["c"].model(reduced).ground_start and not EXPERIMENTS["c.paper"].model(reduced).ground_start
     assert ours["model"] == paper["model"]  # this scale's choices are the paper's already
 
