@@ -110,6 +110,12 @@ def maps_image(maps: np.ndarray, fov: np.ndarray) -> np.ndarray:
     return label_image(label, fov)
 
 
+def flat(masks: np.ndarray) -> np.ndarray:
+    """(K, H, W) bool as one picture, (H, W) in [0, 1]: each mask in a grey of its own, later ones on top."""
+    grey = np.linspace(0.4, 1, len(masks))[::-1] if len(masks) else np.zeros(0)
+    return np.max(masks * grey[:, None, None], axis=0, initial=0)
+
+
 def averages_figure(number: int, records: Sequence[Record]) -> Figure:
     """Both averages of each row of a table: ours with 90 % intervals over test scenes, the paper's as crosses."""
     rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
