@@ -5,6 +5,7 @@ Into `reports/<report>/` go `index.html`, readable without Jupyter, `tables/*.cs
 """
 
 import argparse
+import base64
 import html
 from collections import Counter
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ import matplotlib
 matplotlib.use("Agg")  # pictures go to files, with or without a display
 
 import matplotlib.pyplot as plt
+import nbformat
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -30,7 +32,7 @@ from zerobev.records import Record, RecordStore
 from zerobev.report import averages_figure, cost_table, gallery_figure, table
 from zerobev.runs import SEEDS, recorded
 from zerobev.storage import replacing, write_json
-from zerobev.workspace import Workspace
+from zerobev.workspace import ROOT, Workspace
 
 #: number -> title; table 6 is not in the paper
 TABLES = {
@@ -78,6 +80,7 @@ def write_summary(workspace: Workspace) -> Path:
     sections += [
         "<h2>What it looks like</h2>",
         _gallery(workspace, records),
+        *_any_modality(workspace),
         "<h2>Runs</h2>",
         cost_table(records).to_html(border=0),
     ]
@@ -154,6 +157,27 @@ def _gallery(workspace: Workspace, records: Sequence[Record]) -> str:
         return "<p>No row is recorded.</p>"
     figure = gallery_figure(gallery(workspace), shown)
     return _picture(figure, workspace.reports, "gallery", "Eight views of test homes, spread evenly")
+
+
+def _any_modality(workspace: Workspace) -> list[str]:
+    """The figures of notebook 11 as it was executed last, each under the heading that it stands under."""
+    name = "11_any_modality.ipynb"
+    executed = [folder / name for folder in (workspace.reports / "notebooks", ROOT / "notebooks")]
+    notebook = nbformat.read(next(path for path in executed if path.exists()), as_version=4)
+    sections, heading, count = ["<h2>Any modality</h2>"], "", 0
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            heading = next((line[3:] for line in cell.source.splitlines() if line.startswith("## ")), heading)
+            continue
+        for output in cell.outputs:
+            if "image/png" not in output.get("data", {}):
+                continue
+            path = workspace.reports / "figures" / f"any_modality_{count}.png"
+            with replacing(path) as temporary:
+                temporary.write_bytes(base64.b64decode(output.data["image/png"]))
+            title, count = html.escape(heading), count + 1
+            sections.append(f"<h3>{title}</h3><img src='figures/{path.name}' alt='{title}'>")
+    return sections
 
 
 def _picture(figure: Figure, folder: Path, name: str, text: str) -> str:

@@ -205,6 +205,15 @@ def table(measured: dict[str, Any]) -> list[str]:
     ]
 
 
+def measure(setting: Scale, repeats: int, seconds: float) -> dict[str, Any]:
+    """Everything, in homes that are generated for it: `repeats` stretches, those of views `seconds` long."""
+    with tempfile.TemporaryDirectory() as folder:
+        folders = [home_folder(Path(folder), number) for number in range(max(WORKERS))]
+        views = measure_views(folders, setting, repeats, seconds)
+        pairs = measure_pairs(folders[0], Path(folder) / "views.h5", setting, repeats)
+    return report(setting, views, pairs)
+
+
 def main() -> None:
     """Measure, print the table, and write everything with `--json`."""
     parser = argparse.ArgumentParser(prog="python -m zerobev.streams.benchmark", description=__doc__)
@@ -213,12 +222,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="length of a stretch of views (default: 2)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything measured to FILE")
     options = parser.parse_args()
-    setting = scale(options.scale)
-    with tempfile.TemporaryDirectory() as folder:
-        folders = [home_folder(Path(folder), number) for number in range(max(WORKERS))]
-        views = measure_views(folders, setting, options.repeats, options.seconds)
-        pairs = measure_pairs(folders[0], Path(folder) / "views.h5", setting, options.repeats)
-    measured = report(setting, views, pairs)
+    measured = measure(scale(options.scale), options.repeats, options.seconds)
     for line in table(measured):
         print(line)
     if options.json:
