@@ -1,0 +1,69 @@
+"""What the benchmark counts, against closed forms; that it takes time is not a matter of tests."""
+
+import pytest
+import torch
+from torch import nn
+
+from zerobev import benchmark
+from zerobev.benchmark import ROWS, Machine, blocks, flops, measure_inference, training_step
+from zerobev.config import SCALES
+from zerobev.models import build
+
+SMOKE = SCALES["smoke"]
+
+
+@pytest.fixture(autouse=True)
+def single_thread():
+    torch.set_num_threads(1)
+
+
+def test_operations_of_products_and_convolutions_in_closed_form():
+    a, b = torch.rand(3, 5), torch.rand(5, 7)
+    assert flops(lambda: a @ b) == 2 * 3 * 5 * 7
+    layer, image = nn.Conv2d(4, 6, 3, padding=1), torch.rand(2, 4, 8, 8)
+    forward = 2 * (2 * 8 * 8) * (4 * 9) * 6
+    assert flops(lambda: layer(image)) == forward
+    # the gradient of the weights costs as much again; that of the image is not asked for
+    assert flops(lambda: layer(image).sum().backward()) == 2 * forward
+
+
+def test_blocks_are_all_of_a_step():
+    machine = Machine()
+    net = build("c", SMOKE.camera, SMOKE.model).to(machine.device)
+    batch = machine.batch(SMOKE.camera, 2)
+    step = flops(training_step(net, batch, machine))
+    assert sum(flops(run) for run in blocks(net, batch, machine).values()) == step > 0
+
+
+def test_runs_take_turns_and_the_first_turn_does_not_count(monkeypatch):
+    clock, calls = iter(range(100)), []
+    monkeypatch.setattr(benchmark.time, "perf_counter", lambda: next(clock) ** 2)
+    found = Machine().milliseconds({name: lambda name=name: calls.append(name) for name in "ab"}, repeats=2)
+    assert calls == list("ababab")
+    # the clock is read twice to warm up, then from 2^2 to 3^2 for a, from 4^2 to 5^2 for b, and so on
+    assert found["a"] == {"median": 9e3, "low": 5e3, "high": 13e3}
+    assert found["b"] == {"median": 13e3, "low": 9e3, "high": 17e3}
+
+
+def test_one_call_and_separate_calls_see_the_same_images(monkeypatch):
+    seen = {"shared": [], "separate": []}
+
+    def listen(row, camera, model):
+        net = build(row, camera, model)
+        net.register_forward_pre_hook(lambda _, inputs: seen[current[0]].append(inputs[1].shape[1]))
+        return net
+
+    current = ["shared"]
+
+    def once(self, runs, repeats):
+        for name, run in runs.items():
+            current[0] = name.split()[0]
+            run()
+        return {name: {"median": 1.0} for name in runs}
+
+    monkeypatch.setattr(benchmark, "build", listen)
+    monkeypatch.setattr(benchmark, "MODALITIES", (1, 8))
+    monkeypatch.setattr(Machine, "milliseconds", once)
+    measured = measure_inference(SMOKE, Machine(), repeats=1)
+    assert seen == {"shared": [1, 8] * len(ROWS), "separate": [1] * 9 * len(ROWS)}
+    assert measured["c"]["k8_over_k1"] == 1 and set(measured) == set(ROWS)
