@@ -181,10 +181,10 @@ def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np
     painted = []
     for texel, place, height in images:
         raised = (texel[..., 0] >= 0) & (height > camera.obstacle_m)
-        world = place @ pose.world_R_map[:2, :2].T + (pose.x, pose.y)
-        plan = np.floor(100 * world[raised] + _PLAN_TEXELS / 2) % _PLAN_TEXELS
-        painted.append(texel.copy())
-        painted[-1][raised] = np.column_stack([np.full(len(plan), chart), plan])
+        world = place.reshape(-1, 2) @ pose.world_R_map[:2, :2].T + (pose.x, pose.y)
+        plan = np.full(texel.shape, chart, np.int32)
+        plan[..., 1:] = np.floor(100 * world + _PLAN_TEXELS / 2).reshape(*texel.shape[:2], 2)
+        painted.append(np.where(raised[..., None], plan & (_PLAN_TEXELS - 1), texel).astype(np.int16))
     return tuple(painted)
 
 
