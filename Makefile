@@ -12,6 +12,7 @@ SCENES ?=
 TEXTURES ?=
 FRESH ?=
 SPOT ?=
+PLAN ?=
 export SCALE SCENES TEXTURES SPOT
 
 PYTHON := .venv/bin/python
@@ -31,9 +32,15 @@ help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
 
 # With FRESH=1 every run is computed anyway; otherwise one record is held against a run of today.
-reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper SCENES=dir TEXTURES=dir FRESH=1 SPOT=row]
+# With PLAN=1 it is only told what the run takes; at the paper's scale it is told first, and refused where it cannot be.
+reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper SCENES=dir TEXTURES=dir FRESH=1 SPOT=row PLAN=1]
 	@fresh="$(filter-out 0,$(FRESH))"
+	plan="$(filter-out 0,$(PLAN))"
 	if [ -n "$$TEXTURES" ]; then export ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"; fi
+	if [ -n "$$plan" ] || [ "$$SCALE" = paper ]; then
+	    $(PYTHON) -m zerobev.plan --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} $${TEXTURES:+--textures "$$TEXTURES"}
+	fi
+	[ -z "$$plan" ] || exit 0
 	$(PYTHON) -m zerobev.reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${TEXTURES:+--textures "$$TEXTURES"} $${fresh:+--fresh}
 	$(PYTHON) -m zerobev.summary --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"}

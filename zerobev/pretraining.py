@@ -17,6 +17,7 @@ import torch
 
 from zerobev.errors import InputError
 from zerobev.learning.depth import depth_errors, predict_depth, train_depth
+from zerobev.learning.evaluate import place
 from zerobev.models.depth import DepthNet
 from zerobev.records import git_revision, is_fresh, origin, peak_memory_mb
 from zerobev.storage import replacing, write_json
@@ -73,7 +74,8 @@ class DepthPretraining:
             except (ValueError, KeyError, TypeError) as error:
                 raise InputError(f"{path}: expected the record of a depth estimator, found {error}") from None
         record = self._compute()
-        write_json(path, record)
+        if place()[0] == 0:
+            write_json(path, record)
         return record
 
     @cached_property
@@ -110,7 +112,8 @@ class DepthPretraining:
         trained = time.monotonic()
         device = next(network.parameters()).device.type
         errors = depth_errors(network, workspace.views("test"), device)
-        network.cpu().save(self._weights)
+        if place()[0] == 0:  # of several processes
+            network.cpu().save(self._weights)
         shutil.rmtree(workspace.cache / self.key, ignore_errors=True)  # depth that earlier weights predicted
         (workspace.runs / self.key / "checkpoint.pt").unlink(missing_ok=True)
         return {

@@ -4,19 +4,18 @@ A number in a table comes from a record; a record comes from a command. Beside t
 scene a record holds configuration, seed, recipe version, git revision, library versions, device and time.
 """
 
+import hashlib
 import json
 import os
 import platform
 import resource
 import subprocess
 import time
-import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -24,8 +23,8 @@ from zerobev.errors import InputError
 from zerobev.learning.metrics import Counts
 from zerobev.storage import replacing, write_json
 
-# what NumPy raises for a file that is missing, cut short, or something else
-_DAMAGED = (OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error)
+# what reading JSON raises for a file that is something else
+_NO_RECORD = (OSError, ValueError, KeyError, TypeError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,30 @@ class Record:
     scenes: list[str]  #: test scenes, in the order of the counts
     counts: Counts
     history: dict[str, list[float]]  #: training curves by name, empty for a method that is not trained
+
+    @property
+    def sha256(self) -> str:
+        """Of all that the record says; its maps carry it, so that a number that is changed later does not pass."""
+        # `default`: what is no JSON fails where it is written, after the maps
+        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True, default=str).encode()).hexdigest()
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, for a file."""
+        return {**asdict(self), "counts": self.counts.to_json()}
+
+    @classmethod
+    def from_json(cls, value: Any) -> "Record":
+        """The inverse of `to_json`; raises `InputError`, `KeyError` or `TypeError` for anything else."""
+        kinds = {"key": str, "row": str, "seed": int, "scenes": list}
+        kinds |= dict.fromkeys(("config", "origin", "cost", "history"), dict)
+        for name, kind in kinds.items():
+            if type(value[name]) is not kind:
+                raise InputError(f"{name}: expected {kind.__name__}, found {type(value[name]).__name__}")
+        record = cls(**{**value, "counts": Counts.from_json(value["counts"])})
+        scenes = [name for name in record.scenes if isinstance(name, str)]
+        if not len(scenes) == len(record.scenes) == len(record.counts.union):
+            raise InputError(f"scenes: expected a name for each of {len(record.counts.union)}, found {len(scenes)}")
+        return record
 
 
 class RecordStore:
@@ -63,26 +86,34 @@ class RecordStore:
         if not path.exists() or not is_fresh(path):
             return None
         try:
-            found = json.loads(path.read_text())
-            return Record(**{**found, "counts": Counts.from_json(found["counts"])})
-        except (ValueError, KeyError, TypeError) as error:
+            return Record.from_json(json.loads(path.read_text()))
+        except _NO_RECORD as error:
             raise InputError(f"{path}: expected a record of a run, found {error}") from None
 
     def write(self, record: Record, maps: np.ndarray) -> None:
         """Keep a record, and the maps it predicted for the gallery, (views, classes, M, M) bool."""
         with replacing(self._maps_path(record.key)) as temporary:
-            np.savez_compressed(temporary, maps=np.packbits(maps, axis=-1), cells=maps.shape[-1])
+            packed = np.packbits(maps, axis=-1)
+            np.savez_compressed(temporary, maps=packed, cells=maps.shape[-1], record=record.sha256)
         # the record last: where it is, all of the run is
-        write_json(self.path(record.key), {**asdict(record), "counts": record.counts.to_json()})
+        write_json(self.path(record.key), record.to_json())
 
     def maps(self, key: str) -> np.ndarray:
         """The maps of the gallery's views, (views, classes, M, M) bool."""
         path = self._maps_path(key)
+        found = _arrays(path, "the maps of a run")
         try:
-            with np.load(path) as file:
-                return np.unpackbits(file["maps"], axis=-1, count=int(file["cells"])).astype(bool)
-        except _DAMAGED as error:
-            raise InputError(f"{path}: expected the maps of a run, found {error}") from None
+            packed, cells = found["maps"], int(found["cells"])
+            if packed.ndim != 4 or packed.shape[-1] != -(-cells // 8):
+                raise ValueError(f"maps {packed.shape} for {cells} cells a row")
+            return np.unpackbits(packed, axis=-1, count=cells).astype(bool)
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path}: expected the maps of a run, found {error!r}") from None
+
+    def is_sealed(self, key: str) -> bool:
+        """Whether a record is the one that its maps were written with, to the last digit."""
+        record, sealed = self.find(key), _arrays(self._maps_path(key), "the maps of a run").get("record")
+        return record is not None and sealed is not None and str(sealed) == record.sha256
 
     def write_gallery(self, name: str, **arrays: np.ndarray) -> None:
         """Keep the inputs of the gallery's views."""
@@ -94,14 +125,19 @@ class RecordStore:
         path = self._gallery / f"{name}.npz"
         if not path.exists():
             return None
-        try:
-            with np.load(path) as file:
-                return dict(file)
-        except _DAMAGED as error:
-            raise InputError(f"{path}: expected the gallery's views, found {error}") from None
+        return _arrays(path, "the gallery's views")
 
     def _maps_path(self, key: str) -> Path:
         return self._gallery / f"{key}.npz"
+
+
+def _arrays(path: Path, expected: str) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path) as file:
+            return dict(file)
+    except Exception as error:  # of a damaged file NumPy and zipfile raise nearly everything there is
+        found = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"{path}: expected {expected}, found {found}") from None
 
 
 def kept(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -115,7 +151,7 @@ def kept(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, A
             found = json.loads(path.read_text())
             if found["identity"] == identity:
                 return found["result"]
-        except (ValueError, KeyError, TypeError) as error:
+        except _NO_RECORD as error:
             raise InputError(f"{path}: expected a record, found {error!r}") from None
     revision, started = git_revision(), time.monotonic()
     result = compute()

@@ -1,16 +1,26 @@
-"""The one way to get a run's record: read it, or compute it."""
+"""The one way to get a run's record: read it, or compute it.
 
+As a command, one row: `python -m zerobev.runs --scale S --row R --seed N [--scenes DIR] [--dask ADDRESS]`. It is what
+`accelerate launch` starts on several GPUs: the processes share training and evaluation, the first one writes.
+"""
+
+import argparse
+import contextlib
+import fcntl
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import torch
+from accelerate import PartialState
 
-from zerobev.config import LABELS, Scale
-from zerobev.experiments import EXPERIMENTS, Experiment
+from zerobev.config import LABELS, SCALES, CameraConfig, Scale
+from zerobev.errors import run_command
+from zerobev.experiments import EXPERIMENTS, Experiment, experiment
 from zerobev.gallery import gallery_indices
-from zerobev.learning.evaluate import Predictor, evaluate, model_predictor
+from zerobev.learning.evaluate import Predictor, evaluate, model_predictor, place
 from zerobev.learning.history import History
 from zerobev.learning.monitor import maps_figure
 from zerobev.learning.train import Source, dice_objective, train
@@ -18,6 +28,7 @@ from zerobev.models.checkpoint import BevModel
 from zerobev.models.variants import VARIANTS, build
 from zerobev.models.vpn import VPN
 from zerobev.models.weights import load_backbone
+from zerobev.parallel import cluster
 from zerobev.pretraining import DepthPretraining
 from zerobev.records import Record, RecordStore, git_revision, origin, peak_memory_mb
 from zerobev.streams.projection import project
@@ -28,10 +39,9 @@ from zerobev.streams.tuples import (
     SynthTuples,
     ViewSet,
     collate,
-    semantic_batches,
     semantic_sample,
 )
-from zerobev.workspace import Workspace, fingerprint
+from zerobev.workspace import ROOT, Workspace, fingerprint
 
 #: Raised by hand whenever training or evaluation change what they compute: older records are then left aside.
 RECIPE_VERSION = 4
@@ -87,7 +97,10 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
 
 
 def compute(experiment: Experiment, workspace: Workspace, seed: int, store: RecordStore) -> Record:
-    """Train, evaluate and keep the record in `store`, whether there is one or not."""
+    """Train, evaluate and keep the record in `store`, whether there is one or not.
+
+    Several processes train and evaluate together; all return the record, the first one keeps it.
+    """
     key = run_key(experiment, workspace, seed)
     revision = git_revision()  # of the code that is at work now, whatever is committed in the meantime
     pretraining = DepthPretraining(workspace)
@@ -102,7 +115,7 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     predicted = experiment.reads_depth and experiment.test_depth == "predicted"
     test = pretraining.views("test") if predicted else workspace.views("test")
     trained = time.monotonic()
-    batches = semantic_batches(test.first(workspace.scale.test_views), workspace.scale.camera, _EVALUATION_BATCH)
+    batches = _test_batches(test.first(workspace.scale.test_views), workspace.scale.camera)
     counts = evaluate(predict, batches, len(test.shards), len(LABELS))
     record = Record(
         key=key,
@@ -119,6 +132,8 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
         counts=counts,
         history=history.curves() if history else {},
     )
+    if place()[0] > 0:
+        return record
     batch = collate([semantic_sample(test, i, workspace.scale.camera) for i in gallery_indices(test)])
     with torch.inference_mode():
         maps = predict(batch).cpu()
@@ -126,6 +141,14 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     # the record is complete: a later call for a fresh one starts from the first step
     (workspace.runs / key / "checkpoint.pt").unlink(missing_ok=True)
     return record
+
+
+def _test_batches(views: ViewSet, camera: CameraConfig) -> Iterator[dict[str, torch.Tensor]]:
+    """The views with their eight classes, in order; of several processes each reads a batch in turn."""
+    rank, ranks = place()
+    for first in range(rank * _EVALUATION_BATCH, len(views), ranks * _EVALUATION_BATCH):
+        some = range(first, min(first + _EVALUATION_BATCH, len(views)))
+        yield collate([semantic_sample(views, i, camera) for i in some])
 
 
 def _projection(workspace: Workspace) -> Predictor:
@@ -150,7 +173,8 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     objective = dice_objective(config.alpha, model.config.aux)
     data = InTurn(stages, config.steps)
     history = train(model, data, validation, config, folder, seed, key=key, objective=objective, picture=maps_figure)
-    model.save(folder / "model.safetensors")
+    if place()[0] == 0:
+        model.save(folder / "model.safetensors")
     return model, history
 
 
@@ -186,3 +210,62 @@ class InTurn:
         """The batch of a step, from the stage that the step belongs to."""
         stage = self._stages[min(step * len(self._stages) // self._steps, len(self._stages) - 1)]
         return stage.batch(step, rank, ranks)
+
+
+def main(root: Path = ROOT) -> None:
+    """Parse the command line; compute a record where it is missing, alone or beside other processes of a launch."""
+    parser = argparse.ArgumentParser(prog="python -m zerobev.runs", description=__doc__)
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)}")
+    parser.add_argument("--row", required=True, help=f"one of {', '.join(EXPERIMENTS)}")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster that makes the views")
+    options = parser.parse_args()
+    wanted, workspace = experiment(options.row), Workspace(options.scale, options.scenes, root)
+    with _one_at_a_time(workspace.cache), cluster(options.dask):
+        _make_data(wanted, workspace)
+    # only now do processes learn of each other: before, they would take each other's waiting for a failure
+    state = PartialState(cpu=not torch.cuda.is_available())
+    estimated = _estimated(wanted)
+    if estimated or (wanted.network and not _backbone(wanted, workspace.scale)):
+        pretraining = DepthPretraining(workspace)
+        _ = pretraining.record  # trained by all, where it is missing
+        state.wait_for_everyone()
+        with _one_at_a_time(workspace.cache):
+            for part in estimated:
+                pretraining.views(part)
+    record = run(wanted, workspace, options.seed)
+    if state.is_main_process:
+        iou = f"class {100 * record.counts.class_iou():.2f}, pixel {100 * record.counts.pixel_iou():.2f}"
+        print(f"{RecordStore(workspace.reports).path(record.key)}: IoU in percent: {iou}")
+    state.destroy_process_group()
+
+
+def _make_data(wanted: Experiment, workspace: Workspace) -> None:
+    """The views, and the textures, of a run."""
+    for part in ("train", "validation", "test"):
+        workspace.views(part)
+    if wanted.network and wanted.stream == "synth":
+        workspace.bank(wanted.texture(workspace.scale))
+
+
+def _estimated(wanted: Experiment) -> list[str]:
+    """The splits of which a run takes estimated depth."""
+    if not wanted.reads_depth:
+        return []
+    stages = _stages(wanted)
+    depths = {"train": stages, "validation": stages[-1:], "test": (wanted.test_depth,)}
+    return [part for part, of_part in depths.items() if "predicted" in of_part]
+
+
+@contextlib.contextmanager
+def _one_at_a_time(folder: Path) -> Iterator[None]:
+    """Let the processes that see `folder` in one after the other: the first makes what the others then find."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "data.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+if __name__ == "__main__":
+    run_command(main)

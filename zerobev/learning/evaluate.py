@@ -5,8 +5,9 @@ As a command, `zerobev.learning.real_homes`: the shipped weights on a folder of 
 
 from collections.abc import Callable, Iterable, Mapping
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from zerobev.learning.metrics import Counts, count
 
@@ -21,7 +22,8 @@ def evaluate(
     """Intersections and unions of the maps of `predict`, per test scene (paper, supplement, "Metrics").
 
     predict: is called in inference mode; logits are passed through a sigmoid and thresholded (strictly above)
-    batches: each with what `predict` needs, and `target` (B, K, M, M), `fov` (B, 1, M, M), `scene` (B,) below n_scenes
+    batches: each with what `predict` needs, and `target` (B, K, M, M), `fov` (B, 1, M, M), `scene` (B,) below n_scenes;
+        of several processes each brings its own, and gets the counts of all
     n_classes: K
     """
     total = Counts.empty(n_scenes, n_classes)
@@ -30,7 +32,23 @@ def evaluate(
             maps = predict(batch).to(batch["target"].device)
             predicted = maps if maps.dtype == torch.bool else maps.float().sigmoid() > threshold
             total += count(predicted, batch["target"], batch["fov"], batch["scene"], n_scenes)
-    return total
+    return _over_processes(total)
+
+
+def place() -> tuple[int, int]:
+    """Rank of this process, and the number of those that train and evaluate together: (0, 1) where it is alone."""
+    if not distributed.is_initialized():
+        return 0, 1
+    return distributed.get_rank(), distributed.get_world_size()
+
+
+def _over_processes(counts: Counts) -> Counts:
+    if place()[1] == 1:
+        return counts
+    device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
+    sums = torch.from_numpy(np.stack((counts.intersection, counts.union))).to(device)
+    distributed.all_reduce(sums)
+    return Counts(*sums.cpu().numpy())
 
 
 def model_predictor(model: nn.Module, device: torch.device | str) -> Predictor:

@@ -96,7 +96,7 @@ class Counts:
         """The inverse of `to_json`."""
         try:
             return cls(*(np.array(value[name]) for name in ("intersection", "union")))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"counts: expected lists of integers `intersection` and `union`, found {error}") from error
 
 

@@ -3,6 +3,10 @@
 A step is a pure function of the state before it and of (seed, step): batches are drawn by their step, and
 torch's generator is seeded anew for every step. A run that is killed and started again therefore ends with
 the very weights of an unbroken one.
+
+Several processes (`accelerate launch`) share each batch of a step, and its size stays what is configured. They take
+the steps that one process takes, up to rounding, but for two things: dropout draws differ, and on a CPU a batch norm
+is that of a process's own samples (on GPUs it is that of all). The folder has to be one that all of them see.
 """
 
 import json
@@ -30,6 +34,7 @@ from zerobev.learning.evaluate import model_inputs
 from zerobev.learning.history import Entry, History, columns
 from zerobev.learning.losses import Losses, zero_bev_loss
 from zerobev.learning.monitor import curves_figure, write_picture
+from zerobev.learning.precision import computes_bfloat16
 from zerobev.learning.schedule import Schedule
 from zerobev.progress import progress
 from zerobev.storage import replacing
@@ -91,7 +96,7 @@ def train(
     picture: draws what the model does with the first validation batch, for `sample.png`
     device: default: a GPU if there is one. Forward passes are bfloat16 where the processor computes in it.
     """
-    accelerator = _accelerator(device)
+    accelerator = training_accelerator(device)
     objective = objective or dice_objective(config.alpha)
     forked = [accelerator.device] if accelerator.device.type == "cuda" else []
     with torch.random.fork_rng(forked), _logged(folder / "train.log", accelerator.is_main_process):
@@ -119,6 +124,8 @@ class _Run:
     """Everything that changes during training, and its way to the disk and back."""
 
     def __init__(self, model: nn.Module, config: TrainConfig, folder: Path, key: str, accelerator: Accelerator) -> None:
+        if accelerator.num_processes > 1 and accelerator.device.type == "cuda":
+            nn.SyncBatchNorm.convert_sync_batchnorm(model)  # in place; torch has it for GPUs alone
         self.bare = model
         self.config, self.folder, self.key, self.accelerator = config, folder, key, accelerator
         optimizer = torch.optim.Adam(
@@ -149,7 +156,7 @@ class _Run:
         self.optimizer.zero_grad()
         self.schedule.step()
         self.step += 1
-        values = [float(value.detach()) for value in losses if value is not None]
+        values = self._means(torch.stack([value.detach() for value in losses if value is not None])).tolist()
         if not np.isfinite(values).all():
             raise FloatingPointError(f"step {self.step}: expected finite losses, found {values}")
         self.window.append(values)
@@ -159,19 +166,19 @@ class _Run:
         self.model.eval()
         rank, ranks = self.accelerator.process_index, self.accelerator.num_processes
         with torch.no_grad():
-            scores = [
-                float(
-                    objective(self.model, _moved({k: v[rank::ranks] for k, v in batch.items()}, self.accelerator)).main
-                )
-                for batch in batches
-            ]
-        score = float(np.mean(scores))
+            shares = ({name: value[rank::ranks] for name, value in batch.items()} for batch in batches)
+            scores = [objective(self.model, _moved(share, self.accelerator)).main for share in shares]
+            score = float(np.mean(self._means(torch.stack(scores)).tolist()))
         self.schedule.validated(score)
         if score < self.best_score:
             self.best = {name: value.detach().cpu().clone() for name, value in self.bare.state_dict().items()}
             self.best_step, self.best_score = self.step, score
         self.record(score)
         self.save()
+
+    def _means(self, values: Tensor) -> Tensor:
+        """Over processes: all of them have to keep the same weights, and lower the rate at the same step."""
+        return self.accelerator.reduce(values, reduction="mean")
 
     def show(self, picture: Picture | None, batch: Batch) -> None:
         """Draw the curves so far, and what the model does with a batch."""
@@ -291,13 +298,12 @@ def _step_seed(seed: int, step: int, rank: int) -> int:
     return int(np.random.SeedSequence([seed, step, rank]).generate_state(1, np.uint64)[0])
 
 
-def _accelerator(device: torch.device | str | None) -> Accelerator:
+def training_accelerator(device: torch.device | str | None = None) -> Accelerator:
     """Accelerate's choice of device, held against the wish, in bfloat16 where the hardware has it."""
     wish = None if device is None else torch.device(device).type
     on_gpu = torch.cuda.is_available() and wish != "cpu"
-    capable = torch.cpu.get_capabilities()
-    bf16 = torch.cuda.is_bf16_supported() if on_gpu else capable.get("avx512_bf16") or capable.get("amx_bf16")
-    accelerator = Accelerator(cpu=not on_gpu, mixed_precision="bf16" if bf16 else "no")
+    bfloat16 = computes_bfloat16("cuda" if on_gpu else "cpu")
+    accelerator = Accelerator(cpu=not on_gpu, mixed_precision="bf16" if bfloat16 else "no")
     if wish not in (None, accelerator.device.type):
         raise InputError(f"device: expected {accelerator.device.type}, the one at hand, found {wish}")
     return accelerator

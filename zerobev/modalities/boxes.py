@@ -30,6 +30,12 @@ class Boxes:
     source: str = "given"  #: what found them, in words
 
     def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "corners", np.asarray(self.corners, np.float64))
+            object.__setattr__(self, "scores", np.asarray(self.scores, np.float64))
+            object.__setattr__(self, "labels", tuple(map(str, self.labels)))
+        except (ValueError, TypeError, OverflowError) as error:
+            raise InputError(f"boxes: expected numbers as corners and scores, and labels, found {error}") from None
         count = len(self.labels)
         if np.shape(self.corners) != (count, 4) or np.shape(self.scores) != (count,):
             found = f"{np.shape(self.corners)} and {np.shape(self.scores)}"
@@ -72,8 +78,9 @@ class Boxes:
 
     def _filled(self, shape: tuple[int, int]) -> Iterator[np.ndarray]:
         for corners in self.corners:
-            left, top = np.floor(corners[:2] + 0.5).astype(int)  # pixels with their centre inside, and one at least
-            right, bottom = np.maximum(np.floor(corners[2:] + 0.5).astype(int), (left + 1, top + 1))
+            sides = np.floor(np.clip(corners, -1, max(shape) + 1) + 0.5).astype(int)
+            left, top = sides[:2]  # pixels with their centre inside, and one at least
+            right, bottom = np.maximum(sides[2:], (left + 1, top + 1))
             image = np.zeros(shape, bool)
             image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = True
             yield image

@@ -32,6 +32,11 @@ class Flow:
     after: np.ndarray | None = None  #: (H, W, 3): the second frame
 
     def __post_init__(self) -> None:
+        try:
+            for name in ("start_px", "end_px"):
+                object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
+        except (ValueError, TypeError, OverflowError) as error:
+            raise InputError(f"flow: expected numbers as starts and ends, found {error}") from None
         shapes = np.shape(self.start_px), np.shape(self.end_px)
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 2 or not shapes[0][0]:
             raise InputError(f"flow: expected starts and ends (N, 2) of one vector at least, found {shapes}")
@@ -98,7 +103,7 @@ def flow_field(first: np.ndarray, second: np.ndarray, method: str = "tvl1") -> n
 
 def _discs(points: np.ndarray, shape: tuple[int, int]) -> Iterator[np.ndarray]:
     radius = max(shape[1] * _RADIUS, 1.0)
-    for x, y in points:
+    for x, y in np.clip(points, -(2**20), 2**20):  # far outside is far enough
         image = np.zeros(shape, bool)
         image[disk((y - 0.5, x - 0.5), radius, shape=shape)] = True
         yield image

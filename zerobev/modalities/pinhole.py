@@ -14,6 +14,7 @@ from zerobev.errors import InputError
 
 #: A pixel of the network's image is white where a mask covers this share of it, see `PinholeView.mask`.
 MASK_SHARE = 0.25
+_LEAST_HFOV_DEG = 1e-6  # narrower ones cover no pixel either, and overflow
 
 
 class PinholeView:
@@ -27,15 +28,16 @@ class PinholeView:
     """
 
     def __init__(self, shape: tuple[int, int], hfov_deg: float, camera: CameraConfig) -> None:
-        if not 0 < hfov_deg < 180:
-            raise InputError(f"hfov_deg: expected an angle between 0 and 180 degrees, found {hfov_deg:g}")
-        focal_px = 0.5 * shape[1] / math.tan(math.radians(hfov_deg) / 2)
+        angle = float(hfov_deg) if isinstance(hfov_deg, float | int | np.floating | np.integer) else math.nan
+        if not 0 < angle < 180:
+            raise InputError(f"hfov_deg: expected an angle between 0 and 180 degrees, found {hfov_deg!r}")
+        focal_px = 0.5 * shape[1] / math.tan(math.radians(max(angle, _LEAST_HFOV_DEG)) / 2)
         self._rows, self._columns = (_shares(length, focal_px, camera) for length in shape)
         rows, columns = (shares.sum(axis=1) for shares in (self._rows, self._columns))
         self.covered = (rows[:, None] >= 0.5) & (columns >= 0.5)  #: (S, S) bool, S = camera.fpv_px
         if not self.covered.any():
             expected = f"a field of view that covers a pixel of the network's {camera.hfov_deg:g} degrees"
-            raise InputError(f"hfov_deg: expected {expected}, found {hfov_deg:g}")
+            raise InputError(f"hfov_deg: expected {expected}, found {angle:g}")
         self._area = rows[:, None] * columns
 
     def photograph(self, rgb: np.ndarray) -> np.ndarray:

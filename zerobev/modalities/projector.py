@@ -23,6 +23,8 @@ from zerobev.weights import DEPTH, ROWS, shipped
 
 #: The row that is not trained: P^-1 with estimated depth.
 GEOMETRIC = "a.2"
+#: Binary images that one call takes; a network holds the features of all of them at once.
+MOST_IMAGES = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +57,19 @@ class Projector:
         A photograph taken from another height, or tilted, gives maps that are off by as much as that moves the floor in
         the image. Maps of empty masks are empty.
 
-        Returns a `BevMap`, or `BevArrows` for flow. Raises `InputError` for wrong shapes, types or ranges, NaN, and
-        input that is empty.
+        Returns a `BevMap`, or `BevArrows` for flow. Raises `InputError` for wrong shapes, types or ranges, NaN, input
+        that is empty, and more than `MOST_IMAGES` binary images (real values are eight each).
         """
         photograph = checked_photograph(rgb)
         shape = photograph.shape[:2]
         if not isinstance(modality, Boxes | Flow):
-            modality = _array(modality)
+            modality = _array(modality, "modality")
             if modality.shape == (*shape, 2):
                 modality = Flow.of(modality)
         if isinstance(modality, Flow):
             after = photograph if modality.after is None else checked_photograph(modality.after)
+            if after.shape != photograph.shape:
+                raise InputError(f"after: expected the first frame's shape {photograph.shape}, found {after.shape}")
             starts, ends = modality.discs(shape)
             return BevArrows(self._maps(photograph, starts, hfov_deg), self._maps(after, ends, hfov_deg))
         images = modality.images(shape) if isinstance(modality, Boxes) else binary_images(modality, shape, names)
@@ -84,6 +88,8 @@ class Projector:
     @torch.inference_mode()
     def _maps(self, photograph: np.ndarray, images: BinaryImages, hfov_deg: float) -> BevMap:
         view = PinholeView(photograph.shape[:2], hfov_deg, self.camera)
+        if (count := len(images.labels) * images.levels) > MOST_IMAGES:
+            raise InputError(f"modality: expected {MOST_IMAGES} binary images at most, found {count}")
         zero = torch.from_numpy(np.stack([view.mask(image) for image in images.images])).float()
         rgb = _batch(view.photograph(photograph))
         depth = self._depth(rgb, view)
@@ -137,7 +143,7 @@ def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None)
 
 def checked_photograph(rgb: Any) -> np.ndarray:
     """(H, W, 3) uint8, or floating point in [0, 1] -> float32 in [0, 1]; all else is an `InputError`."""
-    array = np.asarray(rgb)
+    array = _array(rgb, "rgb")
     if array.ndim != 3 or array.shape[-1] != 3 or not array.size:
         raise InputError(f"rgb: expected (H, W, 3), found {array.shape}")
     if array.dtype == np.uint8:
@@ -151,11 +157,11 @@ def checked_photograph(rgb: Any) -> np.ndarray:
     return array.astype(np.float32)
 
 
-def _array(modality: Any) -> np.ndarray:
+def _array(value: Any, name: str) -> np.ndarray:
     try:
-        return np.asarray(modality)
-    except (ValueError, TypeError, RuntimeError):
-        raise InputError(f"modality: expected an array, found {type(modality).__name__} that is none") from None
+        return np.asarray(value)
+    except (ValueError, TypeError, RuntimeError, OverflowError):
+        raise InputError(f"{name}: expected an array, found {type(value).__name__} that is none") from None
 
 
 def _batch(photograph: np.ndarray) -> Tensor:

@@ -25,6 +25,7 @@ RAW_UV = "_TEXCOORD_0"
 _MAGIC, _VERSION = b"glTF", 2
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_IMAGES = ("PNG", "JPEG")  # what glTF allows; PIL would open a PostScript file as well, and run it
 _NEAREST_CLAMPED = {"magFilter": 9728, "minFilter": 9728, "wrapS": 33071, "wrapT": 33071}
 
 
@@ -47,8 +48,8 @@ def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
     """The JSON header of the GLB file at `path`, and its content as trimesh reads it.
 
     Geometries are in the file's order. Their UV coordinates are also in `vertex_attributes[RAW_UV]`, v down and
-    exactly as stored. Images are opened, not decoded. A file that is missing, cut short, no GLB 2, without
-    triangles, not finite, or with images that PIL cannot open, is an `InputError`.
+    exactly as stored. Images are opened, not decoded. A file that is missing, cut short, no GLB 2, compressed,
+    without triangles, not finite, or with images other than PNG and JPEG, is an `InputError`.
     """
     try:
         content = Path(path).read_bytes()
@@ -56,6 +57,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
         raise InputError(f"{path}: expected a GLB file, found {error.strerror}") from error
     header, end = _header(path, content)
     try:
+        _check_accessors(path, header)
         _check_images(path, header, content[end + 8 :])
         for mesh in header.get("meshes", []):
             for primitive in mesh["primitives"]:
@@ -63,7 +65,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
                     primitive["attributes"][RAW_UV] = primitive["attributes"]["TEXCOORD_0"]
         loaded = trimesh.load_scene(io.BytesIO(_container(header, content[end:])), file_type="glb", process=False)
         meshes = list(placed_meshes(loaded))
-        complete = all(len(faces) == 0 or faces.max() < len(vertices) for _, vertices, faces in meshes)
+        complete = all(_is_complete(vertices, faces) for _, vertices, faces in meshes)
         finite = all(np.isfinite(vertices).all() for _, vertices, _ in meshes)
     except InputError:
         raise
@@ -152,13 +154,24 @@ def _header(path: Path, content: bytes) -> tuple[dict[str, Any], int]:
     return header, 20 + size
 
 
+def _check_accessors(path: Path, header: dict[str, Any]) -> None:
+    """glTF lets an accessor have a count and no data: zeros, of which a few bytes of header would fill the memory."""
+    for index, accessor in enumerate(header.get("accessors", [])):
+        if "bufferView" not in accessor:
+            raise InputError(f"{path}: expected data that is not compressed, found none for accessor {index}")
+
+
+def _is_complete(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    return vertices.shape[1:] == (3,) and bool(np.all((faces >= 0) & (faces < len(vertices))))
+
+
 def _check_images(path: Path, header: dict[str, Any], binary: bytes) -> None:
     """trimesh passes over an image that it cannot open; here that is an error."""
     for index, image in enumerate(header.get("images", [])):
         view = header["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
         try:
-            Image.open(io.BytesIO(binary[start : start + view["byteLength"]]))
+            Image.open(io.BytesIO(binary[start : start + view["byteLength"]]), formats=_IMAGES)
         except OSError as error:
             kind = image.get("mimeType", "a file of no type")
             raise InputError(f"{path}: expected a readable PNG or JPEG as image {index}, found {kind}") from error

@@ -24,6 +24,7 @@ _MINIVAL = ("00800", "00802", "00803", "00808")
 _ROW = re.compile(r'([0-9]{1,5}),([0-9A-Fa-f]{6}),"(.*)",(-?[0-9]{1,9})')
 _ROW_FORM = 'id,RRGGBB,"name",region'
 _LARGEST_ID = 65535
+_LARGEST_SIDE = 32767  # of a texture: texels are kept as int16
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def read_scene(folder: Path) -> Scene:
     atlas = _read_atlas(path, annotation, instances)
     photograph_path = folder / f"{stem}.glb"
     photograph_header, photograph = read_glb(photograph_path)
-    unlit = any("KHR_materials_unlit" in m.get("extensions", {}) for m in photograph_header.get("materials", []))
+    unlit = any("KHR_materials_unlit" in (m.get("extensions") or {}) for m in photograph_header.get("materials", []))
     for mesh in photograph.geometry.values():
         image = _texture(mesh)
         if image is not None:
@@ -139,7 +140,8 @@ def read_instances(path: Path) -> tuple[Instance, ...]:
         if match is None or not 1 <= int(match[1]) <= _LARGEST_ID:
             expected = f"{_ROW_FORM} with an id from 1 to {_LARGEST_ID}"
             raise InputError(f"{path}, line {number}: expected {expected}, found {row[:80]!r}")
-        color = tuple(bytes.fromhex(match[2]))
+        red, green, blue = bytes.fromhex(match[2])
+        color = red, green, blue
         instance = Instance(int(match[1]), color, match[3], int(match[4]), label_of(match[3]))
         if instance.id in instances or color in colors:
             raise InputError(f"{path}, line {number}: expected an id and a color not used before, found {row[:80]!r}")
@@ -165,14 +167,19 @@ def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance
     count = 0
     for mesh, positions, triangles in placed_meshes(annotation):
         image = _texture(mesh)
-        uv = mesh.vertex_attributes.get(RAW_UV)
-        if image is None or uv is None:
+        raw_uv = mesh.vertex_attributes.get(RAW_UV)
+        if image is None or raw_uv is None:
             raise InputError(f"{path}: expected a texture and UV coordinates on every mesh, found one without")
+        uv = np.asarray(raw_uv)
+        if uv.shape != (len(positions), 2):
+            raise InputError(f"{path}: expected UV coordinates ({len(positions)}, 2), found {uv.shape}")
         if not np.isfinite(uv).all():
             raise InputError(f"{path}: expected finite UV coordinates, found one that is not")
         if id(image) not in chart_of_image:
             chart_of_image[id(image)] = len(charts)
-            charts.append(id_of_color[_color_codes(_decode(path, image))])
+            charts.append(id_of_color[_color_codes(_decode(path, image, "RGBA"))])
+            if max(charts[-1].shape) > _LARGEST_SIDE:
+                raise InputError(f"{path}: expected at most {_LARGEST_SIDE} texels a side, found {charts[-1].shape}")
         vertices.append(positions)
         faces.append((triangles + count).astype(np.int32))
         face_uv.append(np.clip(uv, 0, 1).astype(np.float32)[triangles])
@@ -191,15 +198,14 @@ def _texture(mesh: trimesh.Geometry) -> Image.Image | None:
     return getattr(getattr(getattr(mesh, "visual", None), "material", None), "baseColorTexture", None)
 
 
-def _decode(path: Path, image: Image.Image) -> Image.Image:
+def _decode(path: Path, image: Image.Image, mode: str | None = None) -> Image.Image:
     try:
         image.load()
+        return image if mode is None else image.convert(mode)
     except Exception as error:  # PIL raises OSError, SyntaxError, ValueError, ... for a broken image
         raise InputError(f"{path}: expected readable textures, found one that is not: {error}") from error
-    return image
 
 
 def _color_codes(image: Image.Image) -> np.ndarray:
-    """(rows, columns) uint32: red, green and blue bytes as one number, red lowest."""
-    pixels = np.asarray(image.convert("RGBA"))
-    return pixels.view("<u4")[..., 0] & 0xFFFFFF
+    """RGBA -> (rows, columns) uint32: red, green and blue bytes as one number, red lowest."""
+    return np.asarray(image).view("<u4")[..., 0] & 0xFFFFFF

@@ -7,12 +7,10 @@ whole. `--verify` holds what is there against the manifest.
 """
 
 import argparse
-import contextlib
 import gc
 import json
 import sys
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,7 @@ import numpy as np
 from zerobev import config
 from zerobev.config import CameraConfig, TextureConfig
 from zerobev.errors import InputError, run_command
-from zerobev.parallel import run_jobs
+from zerobev.parallel import cluster, run_jobs
 from zerobev.progress import progress
 from zerobev.scenes.hm3dsem import read_scene, split_scenes
 from zerobev.storage import write_json
@@ -210,29 +208,13 @@ def main() -> None:
     views = scale.scenes.views if options.views is None else options.views
     split = split_scenes(options.scenes)
     broken: dict[str, str] = {}
-    with _cluster(options.dask):
+    with cluster(options.dask):
         for part in _PARTS:
             folders = list(getattr(split, part))
             out = options.out / part
             broken |= generate(folders, out, views, scale.camera, scale.texture, options.seed, options.workers)
     if broken:
         sys.exit("\n".join(f"skipped {name}: {message}" for name, message in broken.items()))
-
-
-@contextlib.contextmanager
-def _cluster(address: str | None) -> Iterator[None]:
-    """Let joblib work on the dask cluster at `address`, if there is one."""
-    if address is None:
-        yield
-        return
-    from dask.distributed import Client  # not needed, and slow to import, without a cluster
-
-    try:
-        client = Client(address, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise InputError(f"--dask: expected the address of a scheduler, found {address!r}: {error}") from None
-    with client, joblib.parallel_config(backend="dask"):
-        yield
 
 
 if __name__ == "__main__":
