@@ -1,0 +1,243 @@
+"""Do the tests notice? `python -m tests.mutations [NAME ...]` makes one change at a time and runs the tests it is for.
+
+Everything happens in a temporary copy of the tree, files that are not committed yet included. The tests of a change
+are run without it first: those that fail anyway show nothing. Exit code 1 where a change is missed.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from zerobev.errors import InputError, run_command
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """One change, and the tests that have to fail with it: a part of those that `make test` runs."""
+
+    name: str
+    file: str  #: or the pattern of several; all are changed
+    old: str | re.Pattern[str]  #: found once in each file
+    new: str | Callable[[re.Match[str]], str]
+    tests: tuple[str, ...]  #: arguments of pytest
+
+    def apply(self, text: str) -> str:
+        """The file's text with the change; an `InputError` where it does not fit exactly one place."""
+        pattern = self.old if isinstance(self.old, re.Pattern) else re.compile(re.escape(self.old))
+        found = len(pattern.findall(text))
+        if found != 1:
+            raise InputError(f"{self.name}: expected {pattern.pattern!r} once in {self.file}, found it {found} times")
+        if isinstance(self.old, str):
+            return text.replace(self.old, str(self.new))
+        return pattern.sub(self.new, text)
+
+
+def _one_less(match: re.Match[str]) -> str:
+    return match[0][:-1] + str((int(match[0][-1]) - 1) % 10)
+
+
+_RECORDS = ("tests/test_trust.py::test_records_are_as_they_were_written",)
+_RUNS = "tests/test_runs.py::"
+
+MUTATIONS = (
+    # numbers
+    Mutation(
+        "one cell less in a record",
+        "reports/reduced/records/c-seed0-*.json",
+        re.compile(r'"intersection": \[\[\d+'),
+        _one_less,
+        _RECORDS,
+    ),
+    Mutation(
+        "one cell less in a smoke record",
+        "reports/smoke/records/c-seed0-*.json",
+        re.compile(r'"intersection": \[\[\d+'),
+        _one_less,
+        _RECORDS,
+    ),
+    Mutation(
+        "two published rows of Table 1 swapped",
+        "zerobev/paper.py",
+        re.compile(r'(\("b\.1", "VPN[^"]*", )("[^"]*")(\),\s*\("b\.2", "TIM[^"]*", )("[^"]*")'),
+        r"\1\4\3\2",
+        ("tests/test_claims.py::test_every_claim_names_rows_of_its_table_and_holds_in_the_paper",),
+    ),
+    Mutation(
+        "two published rows of Table 4 swapped",
+        "zerobev/paper.py",
+        re.compile(r'(\("c\.10", "[^"]*", )("[^"]*")(\),\s*\("c\.15", "[^"]*", )("[^"]*")'),
+        r"\1\4\3\2",
+        ("tests/test_trust.py::test_published_numbers_are_those_that_were_checked",),
+    ),
+    # axes of the map
+    Mutation(
+        "cells far and near exchanged",
+        "zerobev/sensors/cameras.py",
+        "across[::-1])",
+        "across)",
+        ("tests/test_cameras.py",),
+    ),
+    Mutation(
+        "cells left and right exchanged",
+        "zerobev/sensors/cameras.py",
+        "np.meshgrid(across - camera.bev_extent_m / 2,",
+        "np.meshgrid(camera.bev_extent_m / 2 - across,",
+        ("tests/test_cameras.py",),
+    ),
+    Mutation(
+        "projection far and near exchanged",
+        "zerobev/streams/projection.py",
+        "row = side - 1 - torch.floor(y / camera.cell_m).long()",
+        "row = torch.floor(y / camera.cell_m).long()",
+        ("tests/test_projection.py",),
+    ),
+    Mutation(
+        "projection left and right exchanged",
+        "zerobev/streams/projection.py",
+        "torch.floor((x + camera.bev_extent_m / 2)",
+        "torch.floor((camera.bev_extent_m / 2 - x)",
+        ("tests/test_projection.py",),
+    ),
+    # the zero-shot stream
+    Mutation(
+        "zero-shot image a pixel to the right",
+        "zerobev/streams/tuples.py",
+        '"zero": zero.astype(np.float32)',
+        '"zero": np.roll(zero, 1, axis=-1).astype(np.float32)',
+        ("tests/test_tuples.py",),
+    ),
+    Mutation(
+        "textures a pixel down",
+        "zerobev/streams/tuples.py",
+        "return tuple(self._bank.look_up(image, draw)[None] for image in texels)",
+        "return tuple(self._bank.look_up(np.roll(image, i == 0, 0), draw)[None] for i, image in enumerate(texels))",
+        ("tests/test_tuples.py",),
+    ),
+    # splits
+    Mutation(
+        "trained on the test homes",
+        "zerobev/runs.py",
+        'stream(experiment, workspace, "train", depth, seed)',
+        'stream(experiment, workspace, "test", depth, seed)',
+        (f"{_RUNS}test_training_never_opens_a_test_scene",),
+    ),
+    Mutation(
+        "validated on the test homes",
+        "zerobev/runs.py",
+        'stream(experiment, workspace, "validation",',
+        'stream(experiment, workspace, "test",',
+        (f"{_RUNS}test_training_never_opens_a_test_scene",),
+    ),
+    # depth of (a.2)
+    Mutation(
+        "true depth for (a.2), as configured",
+        "zerobev/experiments.py",
+        'Experiment("a.2", None)',
+        'Experiment("a.2", None, test_depth="gt")',
+        (f"{_RUNS}test_every_row_of_every_table_is_a_run_and_each_run_is_one_row",),
+    ),
+    Mutation(
+        "true depth for (a.2), as computed",
+        "zerobev/runs.py",
+        'test = pretraining.views("test") if predicted else workspace.views("test")',
+        'test = workspace.views("test")',
+        (f"{_RUNS}test_projections_are_what_their_depth_says",),
+    ),
+    # the theorem
+    Mutation(
+        "learned values instead of the identity",
+        "zerobev/theory/attention.py",
+        "return self.attention(features) @ values\n",
+        "return self.aux(features, values)\n",
+        ("tests/test_theory.py::test_cross_attention_is_the_scaled_dot_product",),
+    ),
+)
+
+
+def copy_tree(to: Path) -> None:
+    """All files that git knows or would take, as they stand in the working tree."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    for name in filter(None, listed.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, to / name)
+
+
+def run_tests(tree: Path, tests: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
+    """pytest in `tree`, with the package as it is there, until the first failure."""
+    # no compiled files: one of before a change may pass for that of the change
+    variables = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    return subprocess.run(command, cwd=tree, env=variables, capture_output=True, text=True, check=False)
+
+
+@contextmanager
+def mutated(tree: Path, mutation: Mutation) -> Iterator[None]:
+    """The change, for the length of a `with`."""
+    before = {path: path.read_text() for path in sorted(tree.glob(mutation.file))}
+    if not before:
+        raise InputError(f"{mutation.name}: expected a file {mutation.file}, found none")
+    changed = {path: mutation.apply(text) for path, text in before.items()}
+    for path, text in changed.items():
+        path.write_text(text)
+    try:
+        yield
+    finally:
+        for path, text in before.items():
+            path.write_text(text)
+
+
+def outcome(tree: Path, mutation: Mutation) -> str:
+    """What came of a change: "caught by TEST", "missed", or why that is not known."""
+    with mutated(tree, mutation):
+        ran = run_tests(tree, mutation.tests)
+    if ran.returncode not in (0, 1):  # 1: a test failed; all else says nothing of the tests
+        return f"unknown: pytest ended with {ran.returncode}"
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", ran.stdout, re.MULTILINE)
+    return f"caught by {failed[1]}" if ran.returncode and failed else "missed"
+
+
+def main() -> None:
+    """Parse the command line, try the changes, print what came of them."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutations", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="; ".join(mutation.name for mutation in MUTATIONS))
+    names = parser.parse_args().names or [mutation.name for mutation in MUTATIONS]
+    if unknown := set(names) - {mutation.name for mutation in MUTATIONS}:
+        raise InputError(f"names: expected some of those of --help, found {', '.join(sorted(unknown))}")
+    chosen = [mutation for mutation in MUTATIONS if mutation.name in names]
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "zerobev"
+        copy_tree(tree)
+        unchanged = run_tests(tree, tuple(dict.fromkeys(test for mutation in chosen for test in mutation.tests)))
+        if unchanged.returncode:
+            raise InputError(f"tests: expected none to fail without a change, found:\n{unchanged.stdout[-2000:]}")
+        missed = 0
+        for mutation in chosen:
+            start = time.monotonic()
+            found = outcome(tree, mutation)
+            missed += not found.startswith("caught")
+            print(f"{mutation.name:40} {time.monotonic() - start:6.1f} s  {found}", flush=True)
+    print(f"{len(chosen) - missed} of {len(chosen)} caught")
+    if missed:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    run_command(main)
