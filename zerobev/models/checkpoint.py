@@ -83,9 +83,10 @@ class BevModel(nn.Module):
         try:
             camera = CameraConfig(**described["camera"])
             model = ModelConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in described["model"].items()})
-        except TypeError as error:
-            raise InputError(f"{path}: expected the network's configuration in the metadata, found: {error}") from error
-        network = cls(camera, model)
+            network = cls(camera, model)
+        except Exception as error:  # sizes that are none let every layer fail in its own way
+            found = f"{type(error).__name__}: {error}"
+            raise InputError(f"{path}: expected the network's configuration in the metadata, found: {found}") from error
         try:
             network.load_state_dict(load_file(path))
         except RuntimeError as error:

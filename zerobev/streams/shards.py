@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Iterable
+import shutil
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ def write_shard(
 ) -> None:
     """Write `views` (one at least) of `scene` to `path`, each as it comes; nothing is left behind when one fails."""
     with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
-        for index, view in enumerate(views):
+        for index, view in enumerate(_while_there_is_room(views, path.parent)):
             values = tuple(getattr(view, name) for name in _FIELDS)
             if index == 0:
                 record = np.dtype([(name, value.dtype, value.shape) for name, value in zip(_FIELDS, values)])
@@ -44,6 +45,15 @@ def write_shard(
         file.attrs["charts"] = len(scene.chart_instance)
         file.attrs["recorded_with"] = json.dumps(recorded_with(camera, texture))
         file.attrs["seed"] = seed
+
+
+def _while_there_is_room(views: Iterable[View], folder: Path) -> Iterator[View]:
+    """HDF5 cannot close a file that it could not write, and takes the process with it: the disk is asked before."""
+    for view in views:
+        needed = (1 << 20) + 2 * sum(getattr(view, name).nbytes for name in _FIELDS)
+        if (free := shutil.disk_usage(folder).free) < needed:
+            raise InputError(f"{folder}: expected {needed >> 10} KiB of free disk for a view, found {free >> 10} KiB")
+        yield view
 
 
 class Shard:
