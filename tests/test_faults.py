@@ -1,6 +1,7 @@
 """Kills, full disks and homes that are none: what was whole stays whole, and the next call makes up for the rest."""
 
 import contextlib
+import faulthandler
 import json
 import os
 import resource
@@ -108,6 +109,7 @@ def in_a_child(work: Callable[[], None]) -> int:
     if child == 0:
         code = 1
         with contextlib.suppress(BaseException):
+            faulthandler.disable()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
             work()
             code = 0
