@@ -126,7 +126,8 @@ def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str
     matrix = torch.rand(_MATMUL, _MATMUL, device=machine.device)
     matrix = matrix.bfloat16() if machine.bfloat16 else matrix
     views = Workspace(setting.name).views("train", _SCENES[0])
-    stream = SynthTuples(views, Workspace(setting.name).bank(), setting.camera, 0, setting.train.batch, setting.blank)
+    samples = (setting.camera, 0, setting.train.batch, setting.blank)
+    stream = SynthTuples(views, Workspace(setting.name).bank(), *samples, upright=setting.upright)
     runs: dict[str, Run] = {"matrix product": lambda: matrix @ matrix, "step": training_step(net, batch, machine)}
     runs |= blocks(net, batch, machine) | {"batch": lambda: stream.batch(0)}
     milliseconds = machine.milliseconds(runs, repeats)
