@@ -107,10 +107,15 @@ def objective(model: nn.Module, batch: dict[str, torch.Tensor]) -> Losses:
     return Losses(losses.total + own, losses.main + own, losses.aux)
 
 
-def main(folder: Path, *killed: str) -> None:
-    """One process of a launch: a training, and the command of a run; with `killed` the second one dies in the first."""
-    history = train_frozen(folder / "frozen", killed_at=3 if killed else None)
+def main(folder: Path, how: str = "whole") -> None:
+    """One process of a launch: a training, in which the second one dies if `how` is "killed", and the command of a run.
+
+    "alone" is the training without the run: it takes a process of its own, since accelerate settles its precision once.
+    """
+    history = train_frozen(folder / "frozen", killed_at=3 if how == "killed" else None)
     (folder / f"history{place()[0]}.json").write_text(json.dumps([vars(entry) for entry in history.entries]))
+    if how == "alone":
+        return
     SCALES["tiny"] = TINY
     for kind, name in (RecordStore, "write"), (BevModel, "save"):
         setattr(kind, name, noted(getattr(kind, name), folder / "written"))
@@ -132,13 +137,12 @@ def noted(write: Callable, notes: Path) -> Callable:
 def launch(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
     """`accelerate launch` with two processes, which meet on the CPU."""
     options = ["--num_processes", "2", "--num_machines", "1", "--mixed_precision", "no", "--dynamo_backend", "no"]
-    return subprocess.run(
-        [*LAUNCH, *options, "--main_process_port", "0", __file__, str(folder), *arguments],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
+    return start(*LAUNCH, *options, "--main_process_port", "0", __file__, str(folder), *arguments)
+
+
+def start(*command: str) -> subprocess.CompletedProcess:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=600)
 
 
 @pytest.fixture(scope="module")
@@ -164,13 +168,15 @@ def test_a_launch_that_loses_a_process_stops_and_says_so(launched):
 def test_two_processes_take_the_steps_of_one(launched, tmp_path):
     """Also where one died on the way; and they agree on the score, without which their weights would part."""
     folder, _ = launched
-    alone = train_frozen(tmp_path)
-    ours, theirs = (json.loads((folder / f"history{rank}.json").read_text()) for rank in (0, 1))
-    assert len(ours) == len(alone.entries) == CONFIG.steps
-    for entry, first, second in zip(alone.entries, ours, theirs):
+    ended = start(sys.executable, __file__, str(tmp_path), "alone")
+    assert ended.returncode == 0, ended.stderr
+    files = (tmp_path / "history0.json", folder / "history0.json", folder / "history1.json")
+    alone, ours, theirs = (json.loads(path.read_text()) for path in files)
+    assert len(ours) == len(alone) == CONFIG.steps
+    for entry, first, second in zip(alone, ours, theirs):
         for name in ("step", "loss", "main", "aux", "learning_rate", "validation"):
             assert first[name] == second[name]
-            assert first[name] == pytest.approx(vars(entry)[name], abs=ROUNDING)
+            assert first[name] == pytest.approx(entry[name], abs=ROUNDING)
 
 
 @pytest.mark.slow
