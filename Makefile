@@ -33,7 +33,7 @@ help: ## list the targets
 
 # With FRESH=1 every run is computed anyway; otherwise one record is held against a run of today.
 # With PLAN=1 it is only told what the run takes; at the paper's scale it is told first, and refused where it cannot be.
-reproduce: setup ## run the workbook into reports/ [SCALE=smoke|reduced|paper SCENES=dir TEXTURES=dir FRESH=1 SPOT=row PLAN=1]
+reproduce: setup ## run the workbook [SCALE=smoke|reduced|paper SCENES=dir TEXTURES=dir FRESH=1 SPOT=row PLAN=1]
 	@fresh="$(filter-out 0,$(FRESH))"
 	plan="$(filter-out 0,$(PLAN))"
 	if [ -n "$$TEXTURES" ]; then export ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"; fi

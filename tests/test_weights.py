@@ -107,7 +107,7 @@ def test_every_form_brings_all_weights(form, tmp_path):
         torch.save(torchvision_weights(first), path)
     elif form == "checkpoint":
         tensors = {f"backbone.{name}": tensor for name, tensor in first.state_dict().items()}
-        save_file(tensors | {"head.weight": torch.zeros(1)}, path)
+        save_file({k: t.contiguous() for k, t in tensors.items()} | {"head.weight": torch.zeros(1)}, path)
     elif form == "folder":
         first.network.save_pretrained(path)
     else:
