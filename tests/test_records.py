@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 
 from zerobev.errors import InputError
 from zerobev.learning.metrics import Counts
-from zerobev.records import Record, RecordStore, git_revision, origin
+from zerobev.records import Record, RecordStore, git_revision, kept, origin
 
 MAPS = np.random.default_rng(0).random((2, 8, 5, 5)) < 0.5
 
@@ -125,3 +125,18 @@ def test_origin_says_where_a_number_comes_from():
     assert json.loads(json.dumps(found)) == found
     assert found["device"] == "cpu" and set(found["versions"]) > {"torch", "numpy"}
     assert found["revision"] and str(Path.home()) not in json.dumps(found)
+
+
+def test_what_is_kept_is_computed_once_for_each_identity(tmp_path):
+    path, made = tmp_path / "a.json", []
+
+    def compute() -> dict[str, int]:
+        made.append(len(made))
+        return {"value": made[-1]}
+
+    assert [kept(path, {"weights": "x"}, compute) for _ in range(2)] == [{"value": 0}] * 2
+    assert kept(path, {"weights": "y"}, compute) == {"value": 1}
+    assert made == [0, 1] and {"origin", "seconds"} <= set(json.loads(path.read_text()))
+    path.write_text("{}")
+    with pytest.raises(InputError, match=r"a\.json: expected a record, found KeyError"):
+        kept(path, {"weights": "y"}, compute)

@@ -19,6 +19,7 @@ from zerobev.records import Record
 from zerobev.report import (
     COLORS,
     Checks,
+    flat,
     label_image,
     maps_image,
     plan,
@@ -156,3 +157,10 @@ def test_scoreboard_links_every_claim_to_a_notebook_that_is_there():
         (link,) = re.findall(r"\]\((.*?)\)", line)
         assert (Path(__file__).parents[1] / "notebooks" / link).is_file()
         assert "**not run**" in line
+
+
+def test_masks_share_a_picture_each_in_a_grey_of_its_own():
+    masks = np.zeros((2, 1, 3), bool)
+    masks[0, 0, :2] = masks[1, 0, 1:] = True
+    assert flat(masks).tolist() == [[1.0, 1.0, 0.4]]
+    assert not flat(masks[:0]).any() and flat(masks[:0]).shape == (1, 3)

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from accelerate import PartialState
 
-from zerobev.config import LABELS, SCALES, CameraConfig, Scale
+from zerobev.config import LABELS, SCALES, Scale
 from zerobev.errors import run_command
 from zerobev.experiments import EXPERIMENTS, Experiment, experiment
 from zerobev.gallery import gallery_indices
@@ -39,6 +39,7 @@ from zerobev.streams.tuples import (
     SynthTuples,
     ViewSet,
     collate,
+    semantic_batches,
     semantic_sample,
 )
 from zerobev.workspace import ROOT, Workspace, fingerprint
@@ -115,7 +116,8 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     predicted = experiment.reads_depth and experiment.test_depth == "predicted"
     test = pretraining.views("test") if predicted else workspace.views("test")
     trained = time.monotonic()
-    batches = _test_batches(test.first(workspace.scale.test_views), workspace.scale.camera)
+    views = test.first(workspace.scale.test_views)
+    batches = semantic_batches(views, workspace.scale.camera, _EVALUATION_BATCH, *place())
     counts = evaluate(predict, batches, len(test.shards), len(LABELS))
     record = Record(
         key=key,
@@ -141,14 +143,6 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     # the record is complete: a later call for a fresh one starts from the first step
     (workspace.runs / key / "checkpoint.pt").unlink(missing_ok=True)
     return record
-
-
-def _test_batches(views: ViewSet, camera: CameraConfig) -> Iterator[dict[str, torch.Tensor]]:
-    """The views with their eight classes, in order; of several processes each reads a batch in turn."""
-    rank, ranks = place()
-    for first in range(rank * _EVALUATION_BATCH, len(views), ranks * _EVALUATION_BATCH):
-        some = range(first, min(first + _EVALUATION_BATCH, len(views)))
-        yield collate([semantic_sample(views, i, camera) for i in some])
 
 
 def _projection(workspace: Workspace) -> Predictor:

@@ -215,9 +215,14 @@ class SemanticTuples(TupleStream):
         return class_masks(view, self._views.shards[scene].instance_label)
 
 
-def semantic_batches(views: ViewSet, camera: CameraConfig, batch: int) -> Iterator[dict[str, torch.Tensor]]:
-    """All views once, in order, with the eight classes as modalities (K = 8, in the order of `LABELS`)."""
-    for first in range(0, len(views), batch):
+def semantic_batches(
+    views: ViewSet, camera: CameraConfig, batch: int, rank: int = 0, ranks: int = 1
+) -> Iterator[dict[str, torch.Tensor]]:
+    """All views once, in order, with the eight classes as modalities (K = 8, in the order of `LABELS`).
+
+    With several ranks each gets every `ranks`-th batch.
+    """
+    for first in range(rank * batch, len(views), ranks * batch):
         yield collate([semantic_sample(views, i, camera) for i in range(first, min(first + batch, len(views)))])
 
 
