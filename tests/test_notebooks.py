@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 #: What a cell that draws calls: matplotlib, or a function of the library whose name says so.
 DRAWS = re.compile(r"\bplt\.(?!rc|style|close)|\bfigure\b *[.=]|\bgrid\(|\.(?:imshow|plot)\(")
+LINK = re.compile(r"""\]\((?!https?:|#)([^)#\s]+)|href=['"](?!https?:|#)([^'"#]+)""")
 ABSOLUTE_PATH = re.compile(r"(?<![\w.:/<])/(?:home|root|tmp|work|usr|opt|var|mnt|data|srv|Users|private)\b|\b[A-Z]:\\")
 IGNORING = {f"NBVAL_{mark}" for mark in ("IGNORE_OUTPUT", "SKIP", "RAISES_EXCEPTION")}
 IGNORING |= {"PYTEST_VALIDATE_IGNORE_OUTPUT", "RAISES_EXCEPTION"}
@@ -30,6 +31,11 @@ def code_cells(notebook: NotebookNode) -> list[NotebookNode]:
 
 def tags(cell: NotebookNode) -> list[str]:
     return cell.metadata.get("tags", [])
+
+
+def links(text: str) -> set[str]:
+    """Where links in Markdown and HTML lead, but for those to other sites and within a page."""
+    return {markdown or link for markdown, link in LINK.findall(text)}
 
 
 def outputs(notebook: NotebookNode) -> list[NotebookNode]:
@@ -120,6 +126,17 @@ def prose_leads_to_every_code_cell(notebook: NotebookNode) -> None:
     assert 20 <= statistics.median(words) <= 120
 
 
+def says_how_long_it_takes(notebook: NotebookNode) -> None:
+    assert "**Time.**" in notebook.cells[0].source
+
+
+def every_link_leads_to_a_file(notebook: NotebookNode) -> None:
+    texts = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+    texts += [output.data.get("text/html", "") for output in outputs(notebook) if "data" in output]
+    for link in set().union(*map(links, texts)):
+        assert (ROOT / "notebooks" / link).is_file(), link
+
+
 def ends_with_what_was_checked(notebook: NotebookNode) -> None:
     assert "What we checked" in [cell for cell in notebook.cells if cell.cell_type == "markdown"][-1].source
 
@@ -134,6 +151,8 @@ CHECKS = (
     names_no_place_on_a_machine,
     cells_are_short,
     prose_leads_to_every_code_cell,
+    says_how_long_it_takes,
+    every_link_leads_to_a_file,
     ends_with_what_was_checked,
 )
 
@@ -164,7 +183,7 @@ def sound_notebook() -> NotebookNode:
     return new_notebook(
         metadata={"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}},
         cells=[
-            new_markdown_cell(prose),
+            new_markdown_cell(f"[first](00_tour.ipynb) **Time.** {prose}"),
             new_code_cell('SCALE = "reduced"\nSCENES = ""', execution_count=1, metadata={"tags": ["parameters"]}),
             new_markdown_cell(prose + "</div> and/or https://example.org/data/x"),
             new_code_cell("figure = grid(SCALE)", execution_count=2, outputs=[new_output("display_data", figure)]),
@@ -205,6 +224,9 @@ SPOILED = (
     (cells_are_short, lambda notebook: [cell.update(source="1\n" * 6) for cell in code_cells(notebook)]),
     (prose_leads_to_every_code_cell, lambda notebook: notebook.cells.pop(2)),
     (prose_leads_to_every_code_cell, lambda notebook: [cell.update(source="Now:") for cell in notebook.cells[::2]]),
+    (says_how_long_it_takes, set_source(0, "Zero-BEV")),
+    (every_link_leads_to_a_file, set_source(0, "[gone](99_gone.ipynb)")),
+    (every_link_leads_to_a_file, set_output(5, new_output("display_data", {"text/html": "<a href='99.ipynb'>9</a>"}))),
     (ends_with_what_was_checked, set_source(4, "The end.")),
 )
 
@@ -227,6 +249,14 @@ def test_ignored_outputs_are_counted(tag: str):
     assert ignores_output(new_code_cell("1", metadata={"tags": [tag]}))
     assert ignores_output(new_code_cell("  # NBVAL_IGNORE_OUTPUT\n1"))
     assert not ignores_output(new_code_cell("1  # NBVAL_IGNORE_OUTPUT", metadata={"tags": ["parameters"]}))
+
+
+def test_readme_and_tour_lead_to_every_notebook():
+    readme = links((ROOT / "README.md").read_text())
+    assert {f"notebooks/{path.name}" for path in NOTEBOOKS} <= readme
+    assert all((ROOT / link).exists() for link in readme)
+    tour = links(nbformat.read(NOTEBOOKS[0], as_version=4).cells[0].source)
+    assert tour == {path.name for path in NOTEBOOKS[1:]}
 
 
 def test_the_readme_shows_the_tours_first_picture():
