@@ -106,8 +106,9 @@ def _page(workspace: Workspace, records: Sequence[Record], sections: Sequence[st
 
 def _scoreboard(verdicts: Sequence[Verdict]) -> str:
     paper = Counter(verdict.verdict for verdict in verdicts if verdict.paper is not None)
-    counted = ", ".join(f"<span class='{_css(name)}'>{count} {name}</span>" for name, count in paper.items())
-    head = ("id", "claim", "paper", "ours", "90 % interval", "verdict")
+    order = [name for name in ("holds", "does not hold", "undecided", "not run") if paper[name]]
+    counted = ", ".join(f"<span class='{_css(name)}'>{name}: {paper[name]}</span>" for name in order)
+    heads = _heads(("id", "claim", "paper", "ours", "90 % interval"), text=2) + "<th class='text'>verdict</th>"
     lines = [
         f"<tr><td class='text'>{v.id}</td><td class='text'>{html.escape(v.claim)}</td><td>{_signed(v.paper)}</td>"
         f"<td>{_signed(v.ours)}</td><td>{'' if v.low is None else f'{v.low:+.1f} to {v.high:+.1f}'}</td>"
@@ -115,9 +116,9 @@ def _scoreboard(verdicts: Sequence[Verdict]) -> str:
         for v in verdicts
     ]
     return (
-        f"<h2>Claims</h2><p>Of the paper's {sum(paper.values())} claims: {counted}. Differences in IoU points, means "
+        f"<h2>Claims</h2><p>The paper's {sum(paper.values())} claims - {counted}. Differences in IoU points, means "
         "over seeds, intervals from resampling test homes; claims without a number of the paper are ours.</p>"
-        f"<table><tr>{_heads(head, text=2)}</tr>{''.join(lines)}</table>"
+        f"<table><tr>{heads}</tr>{''.join(lines)}</table>"
     )
 
 
