@@ -26,7 +26,7 @@ export TOKENIZERS_PARALLELISM ?= false
 # Packages come from .venv alone.
 unexport PYTHONHOME PYTHONPATH
 
-.PHONY: help setup reproduce test lab notebooks clean distclean
+.PHONY: help setup reproduce test coverage lab notebooks clean distclean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -53,6 +53,10 @@ test: setup ## run the tests, then check every notebook against its committed ou
 	$(PYTHON) -m pytest --nbval notebooks || status=$$?
 	exit $$status
 
+coverage: setup ## run the tests and say which lines of zerobev/ they reach
+	@$(PYTHON) -m coverage run -m pytest tests
+	$(PYTHON) -m coverage report --skip-covered --sort=cover
+
 lab: setup ## open the notebooks in JupyterLab
 	@$(PYTHON) -c "$$OPEN_LAB" notebooks $$([ "$$(id -u)" != 0 ] || echo --allow-root)
 
@@ -71,7 +75,7 @@ notebooks: setup ## execute the committed notebooks again, in place
 setup: $(RENDERER) ## install the pinned environment into .venv (the other targets do it when needed)
 
 clean: ## remove caches (shards and checkpoints too), executed notebooks and logs; records stay
-	@rm -rf .cache .pytest_cache .ruff_cache .hypothesis *.egg-info reports/*/notebooks reports/*/logs
+	@rm -rf .cache .coverage .pytest_cache .ruff_cache .mypy_cache .hypothesis *.egg-info reports/*/notebooks reports/*/logs
 	find zerobev tests notebooks -depth \( -name __pycache__ -o -name .ipynb_checkpoints \) -exec rm -rf {} +
 
 distclean: clean ## as clean, and remove .venv

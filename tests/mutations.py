@@ -120,8 +120,8 @@ MUTATIONS = (
     Mutation(
         "textures a pixel down",
         "zerobev/streams/tuples.py",
-        "return tuple(self._bank.look_up(image, draw)[None] for image in texels)",
-        "return tuple(self._bank.look_up(np.roll(image, i == 0, 0), draw)[None] for i, image in enumerate(texels))",
+        "zero, target = (self._bank.look_up(image, draw)[None] for image in texels)",
+        "zero, target = (self._bank.look_up(np.roll(a, i == 0, 0), draw)[None] for i, a in enumerate(texels))",
         ("tests/test_tuples.py",),
     ),
     # splits

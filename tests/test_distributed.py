@@ -194,7 +194,7 @@ def test_two_processes_count_what_one_counts_and_the_first_writes(launched, monk
     assert record.history["step"][-1] == TINY.train.steps
     written = (folder / "written").read_text().splitlines()
     assert [of for of in written if not of.startswith("DepthNet")] == ["ZeroBEV 0", "RecordStore 0"]
-    assert not [path for path in folder.rglob(".*part*")]
+    assert not list(folder.rglob(".*part*"))
 
 
 # --- views on a dask cluster

@@ -172,7 +172,7 @@ def broken(path, how):
     elif how == "no widths":
         save_file(tensors, path, metadata={"zerobev": described})
     else:
-        with open(path, "rb") as file:
+        with path.open("rb") as file:
             header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
         metadata = header["__metadata__"]
         if how == "missing weight":

@@ -23,7 +23,7 @@ from zerobev.config import SCALES, CameraConfig, Scale, scale
 from zerobev.errors import run_command
 from zerobev.learning.losses import zero_bev_loss
 from zerobev.learning.precision import computes_bfloat16
-from zerobev.models import ZeroBEV, build
+from zerobev.models import BevModel, ZeroBEV, build
 from zerobev.records import kept, peak_memory_mb
 from zerobev.storage import write_json
 from zerobev.streams import benchmark as generation
@@ -74,7 +74,7 @@ class Machine:
         return {name: image if name in ("rgb", "depth") else image.round() for name, image in random.items()}
 
 
-def training_step(net: ZeroBEV, batch: dict[str, Tensor], machine: Machine) -> Run:
+def training_step(net: BevModel, batch: dict[str, Tensor], machine: Machine) -> Run:
     """One step as `learning.train` takes it: forward, loss, backward, Adam."""
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-4, fused=True)
     net.train()
@@ -122,6 +122,7 @@ def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str
     The peak is that of the matrix product of two matrices of 2048 x 2048, in bfloat16 where training computes in it.
     """
     net = build("c", setting.camera, setting.model).to(machine.device)
+    assert isinstance(net, ZeroBEV)  # as row (c) is
     batch = machine.batch(setting.camera, setting.train.batch)
     matrix = torch.rand(_MATMUL, _MATMUL, device=machine.device)
     matrix = matrix.bfloat16() if machine.bfloat16 else matrix
@@ -213,12 +214,12 @@ def _peak_of(part: str, name: str) -> float:
     elif part == "data":
         workspace = Workspace(name)
         stream = SynthTuples(workspace.views("train", _SCENES[-1]), workspace.bank(), setting.camera, 0, 16)
-        for step in range(20):
-            stream.batch(step)
+        for number in range(20):
+            stream.batch(number)
     return peak_memory_mb()
 
 
-def _one_by_one(net: ZeroBEV, rgb: Tensor, images: Tensor) -> None:
+def _one_by_one(net: BevModel, rgb: Tensor, images: Tensor) -> None:
     for image in images.split(1, dim=1):
         net(rgb, image)
 

@@ -12,7 +12,7 @@ import numpy as np
 from zerobev.config import LABELS
 from zerobev.errors import InputError
 from zerobev.learning.metrics import Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
-from zerobev.paper import TABLES, Claim, Ordering, Ratio, Row, Similar
+from zerobev.paper import TABLES, Ordering, Ratio, Row, Similar
 from zerobev.records import Record
 
 _DRAWS = 1000
@@ -80,7 +80,7 @@ def _measured(claim: Ordering | Similar) -> tuple[tuple[str, ...], Measure]:
     return claim.rows, lambda values: values.max(axis=-1) - values.min(axis=-1)
 
 
-def _named(claim: Claim) -> str:
+def _named(claim: Ordering | Similar) -> str:
     if isinstance(claim, Ordering):
         return f"({claim.better}) > ({claim.worse}), {claim.metric} IoU"
     return f"{', '.join(f'({row})' for row in claim.rows)} within {claim.points} points, {claim.metric} IoU"

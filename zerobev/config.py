@@ -95,8 +95,8 @@ class ModelConfig:
 
     width: int  #: channels of the pyramid, the transformers and the BEV features
     block: str  #: residual block of the RGB backbone: "basic" or "bottleneck"
-    depths: tuple[int, int, int, int]  #: residual blocks in each stage of the RGB backbone
-    channels: tuple[int, int, int, int]  #: output channels of each stage
+    depths: tuple[int, ...]  #: residual blocks in each stage of the RGB backbone
+    channels: tuple[int, ...]  #: output channels of each stage
     stem_channels: int
     stem_stride: int  #: 2 or 4; stage b has stride stem_stride * 2**b
     zero_channels: tuple[int, int, int, int]  #: of the small CNN of the zero-shot stream

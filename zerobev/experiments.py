@@ -33,8 +33,9 @@ class Experiment:
 
     def model(self, scale: Scale) -> ModelConfig:
         """The network's configuration; its variant is not yet part of it."""
-        plain = {"ground_start": False, "zero_gain": 1.0, "residual_gain": 1.0, "prior": 0.5}
-        return replace(scale.model, **plain) if self.paper_start else scale.model
+        if not self.paper_start:
+            return scale.model
+        return replace(scale.model, ground_start=False, zero_gain=1.0, residual_gain=1.0, prior=0.5)
 
     def upright_share(self, scale: Scale) -> float:
         """The share of samples in which all that is raised is painted from above."""

@@ -16,19 +16,19 @@ def gallery(workspace: Workspace) -> dict[str, np.ndarray]:
     """
     store = RecordStore(workspace.reports)
     name = f"views-{fingerprint(workspace.identity)}"
-    if (found := store.gallery(name)) is None:
-        views = workspace.views("test")
-        located = [views.locate(i) for i in gallery_indices(views)]
-        labels = [views.shards[shard].instance_label for shard, _ in located]
-        store.write_gallery(
-            name,
-            rgb=np.stack([view.rgb for _, view in located]),
-            fpv_label=np.stack([label[view.fpv_instance] for label, (_, view) in zip(labels, located)]),
-            bev_label=np.stack([label[view.bev_instance] for label, (_, view) in zip(labels, located)]),
-            fov=np.stack([view.fov for _, view in located]),
-        )
-        found = store.gallery(name)
-    return found
+    if (found := store.gallery(name)) is not None:
+        return found
+    views = workspace.views("test")
+    located = [views.locate(i) for i in gallery_indices(views)]
+    labels = [views.shards[shard].instance_label for shard, _ in located]
+    made = {
+        "rgb": np.stack([view.rgb for _, view in located]),
+        "fpv_label": np.stack([label[view.fpv_instance] for label, (_, view) in zip(labels, located)]),
+        "bev_label": np.stack([label[view.bev_instance] for label, (_, view) in zip(labels, located)]),
+        "fov": np.stack([view.fov for _, view in located]),
+    }
+    store.write_gallery(name, **made)
+    return made
 
 
 def gallery_indices(views: ViewSet) -> list[int]:

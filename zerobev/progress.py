@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 from tqdm import tqdm
@@ -14,7 +15,7 @@ def progress(items: Iterable[T], what: str, unit: str, total: int, done: int = 0
     """Yield `items`, showing how many of `total` are done (`done` of them before) and when the rest will be."""
     log = os.environ.get("ZEROBEV_PROGRESS")
     if log:
-        with open(log, "a") as file:
+        with Path(log).open("a") as file:
             yield from tqdm(items, what, total, initial=done, unit=unit, file=file, mininterval=2, ncols=80)
     else:
         yield from tqdm(items, what, total, initial=done, unit=unit, disable=not sys.stderr.isatty())

@@ -29,7 +29,7 @@ def read_photograph(path: Path) -> np.ndarray:
 
 def read_mask(path: Path) -> np.ndarray:
     """(H, W) bool: pixels of an image file that are not black."""
-    return np.asarray(_open(path).convert("RGB")).any(axis=-1)
+    return np.any(np.asarray(_open(path).convert("RGB")), axis=-1)
 
 
 def read_labels(path: Path) -> np.ndarray:
@@ -99,6 +99,7 @@ def main() -> None:
     modality, names = _modality(options, rgb)
     shape = rgb.shape[:2]
     bev = load(options.row).project(rgb, modality, options.hfov, names)
+    assert isinstance(bev, BevMap)  # no option names flow
     images = modality.images(shape) if isinstance(modality, Boxes) else binary_images(modality, shape, names)
     with replacing(options.out) as temporary:
         figure_of(rgb, images, bev).savefig(temporary, dpi=120)

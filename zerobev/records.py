@@ -40,7 +40,7 @@ class Record:
     cost: dict[str, float]  #: seconds of training and evaluation, peak memory in MB
     scenes: list[str]  #: test scenes, in the order of the counts
     counts: Counts
-    history: dict[str, list[float]]  #: training curves by name, empty for a method that is not trained
+    history: dict[str, list[float | None]]  #: training curves by name, empty for a method that is not trained
 
     @property
     def sha256(self) -> str:
@@ -119,7 +119,7 @@ class RecordStore:
     def write_gallery(self, name: str, **arrays: np.ndarray) -> None:
         """Keep the inputs of the gallery's views."""
         with replacing(self._gallery / f"{name}.npz") as temporary:
-            np.savez_compressed(temporary, **arrays)
+            np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]  # as in `BevMap.save`
 
     def gallery(self, name: str) -> dict[str, np.ndarray] | None:
         """The inputs of the gallery's views, or None where they have to be made."""
@@ -193,6 +193,7 @@ def origin(device: str, revision: str) -> dict[str, Any]:
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
     status = Path("/proc/self/status")
-    if status.exists():  # Linux; `getrusage` would count the process that started this one, too
-        return round(int(re.search(r"VmHWM:\s+(\d+) kB", status.read_text())[1]) / 1024, 1)
+    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
+    if found:  # Linux; `getrusage` would count the process that started this one, too
+        return round(int(found[1]) / 1024, 1)
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)

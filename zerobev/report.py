@@ -1,6 +1,6 @@
 """Records and the paper's numbers -> the tables and figures that notebooks share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -153,7 +153,7 @@ def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarra
     return figure
 
 
-def grid(columns: Sequence[tuple[str, Sequence[np.ndarray]]], side: float = 1.5) -> Figure:
+def grid(columns: Sequence[tuple[str, Collection[np.ndarray]]], side: float = 1.5) -> Figure:
     """A figure of image columns, each with a title and one image a row; 2-D images are shown in grey."""
     rows = len(columns[0][1])
     figure, axes = plt.subplots(rows, len(columns), figsize=(side * len(columns), side * rows + 0.3), squeeze=False)

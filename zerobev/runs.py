@@ -8,7 +8,7 @@ import argparse
 import contextlib
 import fcntl
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,14 @@ from typing import Any
 import torch
 from accelerate import PartialState
 
-from zerobev.config import LABELS, SCALES, Scale
+from zerobev.config import LABELS, SCALES, CameraConfig, Scale
 from zerobev.errors import run_command
 from zerobev.experiments import EXPERIMENTS, Experiment, experiment
 from zerobev.gallery import gallery_indices
 from zerobev.learning.evaluate import Predictor, evaluate, model_predictor, place
 from zerobev.learning.history import History
 from zerobev.learning.monitor import maps_figure
-from zerobev.learning.train import Source, dice_objective, train
+from zerobev.learning.train import Batch, Source, dice_objective, train
 from zerobev.models.checkpoint import BevModel
 from zerobev.models.variants import VARIANTS, build
 from zerobev.models.vpn import VPN
@@ -91,7 +91,7 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
         config["depth"] = DepthPretraining(workspace).key
     if experiment.network is not None:
         texture = workspace.texture_identity(experiment.texture(scale))
-        config |= {"model": asdict(experiment.model(scale)), "backbone": _backbone(experiment, scale)}
+        config |= {"model": asdict(experiment.model(scale)), "backbone": _backbone(experiment.network, scale)}
         config |= {"train": asdict(scale.train), "texture": texture}
         config |= {"blank": experiment.blank(scale), "upright": experiment.upright_share(scale)}
     return config
@@ -157,9 +157,10 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     that it is trained on, with the depth of the last stage, and with one fixed seed, so that scores of runs compare.
     """
     scale, config = workspace.scale, workspace.scale.train
+    assert experiment.network is not None  # P^-1 is not trained
     torch.manual_seed(seed)
     model = build(experiment.network, scale.camera, experiment.model(scale))
-    load_backbone(model.backbone, _backbone(experiment, scale) or DepthPretraining(workspace).weights)
+    load_backbone(model.backbone, _backbone(experiment.network, scale) or DepthPretraining(workspace).weights)
     folder = workspace.runs / key
     stages = [stream(experiment, workspace, "train", depth, seed) for depth in _stages(experiment)]
     held_out = stream(experiment, workspace, "validation", _stages(experiment)[-1], seed=0)
@@ -172,9 +173,9 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     return model, history
 
 
-def _backbone(experiment: Experiment, scale: Scale) -> str:
+def _backbone(network: str, scale: Scale) -> str:
     """Where the first weights of its RGB backbone come from; empty: the depth estimator."""
-    return scale.vpn_backbone if VARIANTS[experiment.network][0] is VPN else scale.backbone
+    return scale.vpn_backbone if VARIANTS[network][0] is VPN else scale.backbone
 
 
 def _stages(experiment: Experiment) -> tuple[str, ...]:
@@ -189,9 +190,9 @@ def stream(experiment: Experiment, workspace: Workspace, part: str, depth: str, 
     if experiment.stream == "synth":
         bank = workspace.bank(experiment.texture(scale))
         return SynthTuples(views, bank, *common, experiment.fresh, experiment.upright_share(scale))
-    return {"modsem": ModSemTuples, "depthproj": DepthProjTuples, "classes": SemanticTuples}[experiment.stream](
-        views, *common
-    )
+    kinds: dict[str, Callable[[ViewSet, CameraConfig, int, int, float], Source]]
+    kinds = {"modsem": ModSemTuples, "depthproj": DepthProjTuples, "classes": SemanticTuples}
+    return kinds[experiment.stream](views, *common)
 
 
 class InTurn:
@@ -200,7 +201,7 @@ class InTurn:
     def __init__(self, stages: list[Source], steps: int) -> None:
         self._stages, self._steps = stages, steps
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, torch.Tensor]:
+    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> Batch:
         """The batch of a step, from the stage that the step belongs to."""
         stage = self._stages[min(step * len(self._stages) // self._steps, len(self._stages) - 1)]
         return stage.batch(step, rank, ranks)
@@ -221,7 +222,7 @@ def main(root: Path = ROOT) -> None:
     # only now do processes learn of each other: before, they would take each other's waiting for a failure
     state = PartialState(cpu=not torch.cuda.is_available())
     estimated = _estimated(wanted)
-    if estimated or (wanted.network and not _backbone(wanted, workspace.scale)):
+    if estimated or (wanted.network and not _backbone(wanted.network, workspace.scale)):
         pretraining = DepthPretraining(workspace)
         _ = pretraining.record  # trained by all, where it is missing
         state.wait_for_everyone()

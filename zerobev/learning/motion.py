@@ -16,6 +16,7 @@ from scipy.stats import bootstrap
 
 from zerobev.config import AgentConfig, CameraConfig
 from zerobev.errors import InputError, run_command
+from zerobev.modalities.bev_map import BevArrows
 from zerobev.modalities.flow import Flow, flow_field
 from zerobev.modalities.projector import GEOMETRIC, Projector, load
 from zerobev.progress import progress
@@ -79,9 +80,9 @@ def moving_pair(scene: Scene, camera: CameraConfig, rng: np.random.Generator) ->
         seen_first = caster.fpv(pose, fine)
         points = map_points(torch.from_numpy(seen_first.distance).double(), fine).numpy()
         on_object = seen_first.instance == chosen
-        photographs = [Photographer(one, fine).take(pose) for one in (scene, after)]
+        first, second = (Photographer(one, fine).take(pose) for one in (scene, after))
         flow = true_flow(points, motion, fine) * on_object[..., None]
-        return MovingPair(*photographs, on_object, points[..., :2], flow, motion[:2])
+        return MovingPair(first, second, on_object, points[..., :2], flow, motion[:2])
     raise InputError(f"scene {scene.name}: expected an object that can be seen to move, found none in {_TRIES} views")
 
 
@@ -106,6 +107,7 @@ def arrow_errors(projector: Projector, pair: MovingPair, field: np.ndarray) -> p
     except InputError:  # the object's flow is all below a pixel
         return None
     arrows = projector.project(pair.first, flow)
+    assert isinstance(arrows, BevArrows)  # as of every flow
     column, row = np.floor(flow.start_px).astype(int).T
     start = pair.point_m[row, column]
     predicted = {"start": arrows.start_m - start, "end": arrows.end_m - start - pair.motion_m}

@@ -16,7 +16,7 @@ class Schedule:
     """
 
     def __init__(self, optimizer: Optimizer, config: TrainConfig) -> None:
-        self._steps = [lr_scheduler.StepLR(optimizer, config.decay_every, config.decay)]
+        self._steps: list[lr_scheduler.LRScheduler] = [lr_scheduler.StepLR(optimizer, config.decay_every, config.decay)]
         if config.warmup > 1:
             self._steps.append(lr_scheduler.LinearLR(optimizer, 1 / config.warmup, total_iters=config.warmup - 1))
         self._plateau = lr_scheduler.ReduceLROnPlateau(optimizer, factor=0.5, patience=config.patience)

@@ -14,7 +14,7 @@ import logging
 import pickle
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import asdict
@@ -51,7 +51,7 @@ log = logging.getLogger("zerobev.train")
 class Source(Protocol):
     """Training data without an end, addressed by step."""
 
-    def batch(self, step: int, rank: int, ranks: int) -> Batch:
+    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> Batch:
         """The share of process `rank` of `ranks` in the batch of `step`.
 
         The batch holds the samples `step * n ... (step + 1) * n - 1`, n = `TrainConfig.batch`; a process gets every
@@ -271,7 +271,7 @@ def _read_checkpoint(path: Path, key: str) -> dict[str, Any] | None:
     return state
 
 
-def _batches(data: Source, first: int, steps: int, accelerator: Accelerator) -> Iterator[Batch]:
+def _batches(data: Source, first: int, steps: int, accelerator: Accelerator) -> Generator[Batch, None, None]:
     """Batches of the steps `first` to `steps - 1`.
 
     For a GPU each is made in a second thread during the step before it. Not so on a CPU: a thread more than there are

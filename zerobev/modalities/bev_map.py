@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from zerobev.storage import replacing
 
 _FLOOR, _OUTSIDE = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
 _LONGEST_LEGEND = 12
-_COLORS = [color for name in ("tab10", "Set2", "Set1") for color in plt.get_cmap(name).colors]
+_COLORS = [color for name in ("tab10", "Set2", "Set1") for color in matplotlib.color_sequences[name]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class BevMap:
     def image(self) -> np.ndarray:
         """(M, M, 3) float64: each map in a colour of its own, larger ones below smaller ones."""
         image = np.where(self.fov[..., None], _FLOOR, _OUTSIDE)
-        for k in np.argsort(-self.maps.sum(axis=(1, 2)), kind="stable"):
+        for k in np.argsort(-self.maps.sum(axis=(1, 2)), kind="stable").tolist():
             opacity = (self.values[k] * self.fov * (self.values[k] > 0.1))[..., None]
             image = (1 - opacity) * image + opacity * np.array(color_of(k))
         return image
@@ -85,10 +86,10 @@ class BevMap:
         axes.set(xlabel="right [m]", ylabel="forward [m]")
         found = self.maps.any(axis=(1, 2))
         if self.scores is not None:
-            for k in np.flatnonzero(~found):
+            for k in np.flatnonzero(~found).tolist():
                 axes.plot(*self.centres_m[k], "x", color=color_of(k))
             found |= np.isfinite(self.centres_m).all(axis=1)
-        shown = np.flatnonzero(found)
+        shown = np.flatnonzero(found).tolist()
         if 0 < len(shown) <= _LONGEST_LEGEND:
             patches = [Patch(color=color_of(k), label=self._title(k)) for k in shown]
             axes.legend(handles=patches, fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
@@ -106,7 +107,7 @@ class BevMap:
                 labels=np.array(self.labels),
                 extent=self.extent,
                 cell_m=self.cell_m,
-                **scores,
+                **scores,  # type: ignore[arg-type]  # NumPy's stub takes all for `allow_pickle`
             )
 
     def _title(self, k: int) -> str:
@@ -141,8 +142,7 @@ class BevArrows:
         field = np.where(self.starts.fov[..., None], _FLOOR, _OUTSIDE)
         axes.imshow(field, extent=self.extent, interpolation="nearest")
         start, vector = self.start_m, self.end_m - self.start_m
-        grid = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.006}
-        axes.quiver(*start.T, *vector.T, color=color, **grid)
+        axes.quiver(*start.T, *vector.T, color=color, angles="xy", scale_units="xy", scale=1, width=0.006)
         axes.set(xlabel="right [m]", ylabel="forward [m]")
         return axes
 

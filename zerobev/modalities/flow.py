@@ -3,7 +3,7 @@
 Each vector is projected as two images: a filled circle at its start, and one at its end.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -15,7 +15,10 @@ from skimage.registration import optical_flow_ilk, optical_flow_tvl1
 from zerobev.errors import InputError
 from zerobev.modalities.images import BinaryImages
 
-METHODS = {"tvl1": optical_flow_tvl1, "ilk": optical_flow_ilk}
+METHODS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "tvl1": optical_flow_tvl1,
+    "ilk": optical_flow_ilk,
+}
 _RADIUS = 1 / 32  # of a disc, as a share of the image's width
 _SPACING = 1 / 24  # of vectors, likewise
 

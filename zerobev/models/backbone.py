@@ -52,6 +52,9 @@ class RgbEncoder(nn.Module):
     Raises `InputError` for a stem stride other than 2 and 4.
     """
 
+    mean: Tensor  #: (3, 1, 1)
+    std: Tensor  #: (3, 1, 1)
+
     def __init__(self, model: ModelConfig):
         super().__init__()
         if model.stem_stride not in (2, 4):
@@ -60,7 +63,8 @@ class RgbEncoder(nn.Module):
         self.network = resnet(3, model.stem_channels, model.channels, model.depths, model.block, max_pool)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
-        self.to(memory_format=torch.channels_last)  # all maps follow, which saves a fifth of a step on a CPU
+        # all maps follow, which saves a fifth of a step on a CPU; torch's stub lacks the argument
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, rgb: Tensor) -> tuple[Tensor, ...]:
         """(B, 3, H, W) float32 in [0, 1] -> maps (B, channels[b], R_b, C_b), finest first."""
@@ -82,13 +86,14 @@ class ZeroCNN(nn.Module):
         super().__init__()
         self.fold = stem_stride // 2
         widths = (in_channels * self.fold**2, *channels)
-        self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
-        for layer in self.layers:
+        layers = [nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths)]
+        for layer in layers:
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-            nn.init.zeros_(layer.bias)
+            nn.init.zeros_(layer.get_parameter("bias"))
         with torch.no_grad():
-            self.layers[0].weight.mul_(gain)
-        self.to(memory_format=torch.channels_last)
+            layers[0].weight.mul_(gain)
+        self.layers = nn.ModuleList(layers)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, zero: Tensor) -> list[Tensor]:
         """(N, in_channels, H, W) -> maps (N, channels[b], ceil(H / stride_b), ceil(W / stride_b)), finest first."""

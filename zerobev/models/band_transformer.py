@@ -139,6 +139,9 @@ class BandTransformer(nn.Module):
     that: as long as the attention is diffuse, the Dice loss has its minimum at an all-white map.
     """
 
+    position: Tensor  #: (rows, width)
+    ray_position: Tensor  #: (positions, width)
+
     def __init__(
         self,
         width: int,
@@ -152,11 +155,12 @@ class BandTransformer(nn.Module):
     ):
         super().__init__()
         self.encoder = nn.ModuleList(EncoderLayer(width, heads, hidden, dropout) for _ in range(layers))
-        self.decoder = nn.ModuleList(DecoderLayer(width, heads, hidden, dropout) for _ in range(layers))
+        decoder = [DecoderLayer(width, heads, hidden, dropout) for _ in range(layers)]
+        self.decoder = nn.ModuleList(decoder)
         self.ray = nn.Parameter(torch.empty(positions, width))
         ground = floor_rows is not None
         gain = _GROUND_POSITION if ground else 1.0
-        seen_at = floor_rows if ground else torch.arange(positions)
+        seen_at = torch.arange(positions) if floor_rows is None else floor_rows
         self.register_buffer("position", gain * sinusoids(torch.arange(rows), width), persistent=False)
         self.register_buffer("ray_position", gain * sinusoids(seen_at, width), persistent=False)
         for parameter in self.parameters():
@@ -164,7 +168,7 @@ class BandTransformer(nn.Module):
                 nn.init.xavier_uniform_(parameter)
         if ground:
             nn.init.zeros_(self.ray)
-            for layer in self.decoder:
+            for layer in decoder:
                 layer.cross_attention.start_equal(_GROUND_WEIGHT)
 
     def attend(self, columns: Tensor) -> tuple[Tensor, BandAttention]:

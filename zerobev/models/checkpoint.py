@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from zerobev.config import AUX, CameraConfig, ModelConfig
 from zerobev.errors import InputError
+from zerobev.models.backbone import RgbEncoder
 from zerobev.storage import replacing
 
 #: Zero-shot images that pass a network together, at most (a batch with more samples passes whole).
@@ -37,6 +38,8 @@ class BevModel(nn.Module):
     Raises `InputError` for auxiliary maps that do not exist.
     """
 
+    backbone: RgbEncoder  #: every network has one
+
     def __init__(self, camera: CameraConfig, model: ModelConfig):
         super().__init__()
         if tuple(name for name in AUX if name in model.aux) != tuple(model.aux):
@@ -48,7 +51,7 @@ class BevModel(nn.Module):
 
         Raises `InputError` that names the first image that does not.
         """
-        side, batch = self.camera.fpv_px, None
+        side, batch = self.camera.fpv_px, 0  # 0: not known yet
         for name, (image, channels) in images.items():
             found = None if image is None else tuple(image.shape)
             if found is not None and len(found) == 4:
@@ -82,8 +85,8 @@ class BevModel(nn.Module):
             raise InputError(f"{path}: expected a checkpoint of {cls.__name__}, found one of {described['class']}")
         try:
             camera = CameraConfig(**described["camera"])
-            model = ModelConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in described["model"].items()})
-            network = cls(camera, model)
+            fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in described["model"].items()}
+            network = cls(camera, ModelConfig(**fields))
         except Exception as error:  # sizes that are none let every layer fail in its own way
             found = f"{type(error).__name__}: {error}"
             raise InputError(f"{path}: expected the network's configuration in the metadata, found: {found}") from error

@@ -33,6 +33,12 @@ class DepthEstimator(Protocol):
     def __call__(self, rgb: Tensor) -> Tensor:
         """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres."""
 
+    def to(self, device: torch.device | str) -> Self:
+        """Itself, moved to a device."""
+
+    def eval(self) -> Self:
+        """Itself, in evaluation mode."""
+
 
 class DepthNet(BevModel):
     """Backbone, top-down decoder, and one inverse depth a pixel; for images of the given camera.
@@ -42,6 +48,8 @@ class DepthNet(BevModel):
     not know how far the floor is that it sees at some row.
     """
 
+    rays: Tensor  #: (1, 2, H, W)
+
     def __init__(self, camera: CameraConfig, model: ModelConfig):
         super().__init__(camera, model)
         self.backbone = RgbEncoder(model)
@@ -49,7 +57,7 @@ class DepthNet(BevModel):
         self.merges = nn.ModuleList(convolution(model.width, model.width) for _ in model.channels)
         self.head = nn.Conv2d(model.width, model.stem_stride**2, 1)  # one a pixel under a cell of the finest map
         rays = torch.from_numpy(fpv_rays(camera)[..., :2]).float().permute(2, 0, 1)[None]
-        self.register_buffer("rays", rays, persistent=False)  # 1 2 H W
+        self.register_buffer("rays", rays, persistent=False)
 
     def forward(self, rgb: Tensor) -> Tensor:
         """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres, up to `FARTHEST_M`."""
@@ -70,6 +78,9 @@ class HubDepth(nn.Module):
     Photographs are normalised and resized (bilinear) to what the network takes, the depth is resized back. The size is
     the next multiple of the network's patch, 14 pixels for Depth Anything; the DPT hybrid takes its own size alone.
     """
+
+    mean: Tensor  #: (3, 1, 1)
+    std: Tensor  #: (3, 1, 1)
 
     def __init__(
         self,
@@ -127,7 +138,7 @@ def _pair(size: int | Iterable[int]) -> tuple[int, int]:
     return height, width
 
 
-def _resized(images: Tensor, size: tuple[int, int]) -> Tensor:
+def _resized(images: Tensor, size: tuple[int, ...]) -> Tensor:
     if tuple(images.shape[-2:]) == tuple(size):
         return images
     return F.interpolate(images, size=size, mode="bilinear", align_corners=False)

@@ -3,7 +3,8 @@
 Paper, supplement, "FPV to BEV transformers". The finest map feeds the farthest band.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -45,7 +46,7 @@ class FpvToBev(nn.Module):
     @property
     def valid(self) -> Tensor:
         """(M, M) bool: the cells that an image column sees."""
-        return torch.cat([resampler.valid for resampler in reversed(self.resamplers)])
+        return torch.cat([resampler.get_buffer("valid") for resampler in reversed(self.resamplers)])
 
     def forward(self, maps: Sequence[Tensor]) -> tuple[Tensor, list[BandAttention]]:
         """Maps (N, width, R_b, C_b), finest first -> BEV features (N, width, M, M), and the attention of every band.
@@ -53,7 +54,8 @@ class FpvToBev(nn.Module):
         Features are zero outside `valid`. Attention is near band first; the batch of its tensors is N * C, image column
         fastest.
         """
-        rays, attention = zip(*(band.attend(columns(m)) for band, m in zip(self.bands, reversed(maps))))
+        bands = cast(Iterable[BandTransformer], self.bands)  # torch's lists do not say what they hold
+        rays, attention = zip(*(band.attend(columns(m)) for band, m in zip(bands, reversed(maps))))
         return self.to_map([r.unflatten(0, (len(maps[0]), -1)) for r in rays]), list(attention)
 
     def to_map(self, rays: Sequence[Tensor]) -> Tensor:

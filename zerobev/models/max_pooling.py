@@ -58,7 +58,7 @@ class Gates(nn.Module):
         self.side, self.stride = camera.fpv_px, stride
         self.head = nn.Conv2d(width, camera.bev_px * stride**2, 1)  # for each pixel under a feature
         nn.init.normal_(self.head.weight, std=0.3 * width**-0.5)
-        nn.init.zeros_(self.head.bias)
+        nn.init.zeros_(self.head.get_parameter("bias"))
         away = torch.arange(camera.fpv_px) - floor_row(camera, range(camera.bev_px), 1)[:, None]
         self.prior = nn.Parameter((-away.abs() / (_FLOOR_WIDTH * camera.fpv_px)).clamp(min=_LOWEST).float())  # P H
 
@@ -100,7 +100,10 @@ class MaxPoolZeroBEV(BevModel):
         gates = self.gates(features)
         pooled = noisy_or(gates, zero.permute(0, 3, 2, 1))  # B W P K
         pooled = self.resample_pixels(pooled)[0].permute(0, 3, 1, 2)  # B K M M
-        seen = [pooled, project(zero, depth, self.camera)] if self.config.residual else [pooled]
+        seen = [pooled]
+        if self.config.residual:
+            assert depth is not None  # as checked
+            seen.append(project(zero, depth, self.camera))
         known = self.map_features(features, gates)[:, None] + self.embedding(
             torch.stack(seen, dim=2).flatten(0, 1)
         ).unflatten(0, zero.shape[:2])

@@ -61,6 +61,9 @@ class PolarToCartesian(nn.Module):
     column sees are zero.
     """
 
+    weights: Tensor  #: (P, M, C)
+    valid: Tensor  #: (P, M) bool
+
     def __init__(self, camera: CameraConfig, rows: range, stride: int):
         super().__init__()
         u = image_column(camera, rows)
@@ -69,8 +72,8 @@ class PolarToCartesian(nn.Module):
         valid = (u >= 0) & (u <= camera.fpv_px)
         # A linear interpolation gives column i the weight of a hat of half-width 1 around it.
         weights = (1 - (position[..., None] - torch.arange(columns)).abs()).clamp(min=0) * valid[..., None]
-        self.register_buffer("weights", weights.float(), persistent=False)  # P M C
-        self.register_buffer("valid", valid, persistent=False)  # P M
+        self.register_buffer("weights", weights.float(), persistent=False)
+        self.register_buffer("valid", valid, persistent=False)
 
     def forward(self, rays: Tensor) -> tuple[Tensor, Tensor]:
         """Rays (B, C, P, d), position p on map row `rows[p]` -> features (B, P, M, d), validity mask (P, M) bool."""

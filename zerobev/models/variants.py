@@ -44,7 +44,7 @@ def build(row: str, camera: CameraConfig, model: ModelConfig) -> BevModel:
         raise InputError(f"row: expected one of {', '.join(VARIANTS)}, found {row!r}")
     kind, changes = VARIANTS[row]
     network = kind(camera, replace(model, **changes))
-    bias = network.decoder.head.bias
+    bias = network.get_parameter("decoder.head.bias")
     with torch.no_grad():
         bias[: len(bias) - len(network.config.aux)] += math.log(model.prior / (1 - model.prior))
     return network
@@ -52,7 +52,8 @@ def build(row: str, camera: CameraConfig, model: ModelConfig) -> BevModel:
 
 def load_model(path: Path) -> BevModel:
     """The network saved in `path`, whatever its class; as `BevModel.load`, which names what is wrong with a file."""
-    classes = {network.__name__: network for network in (*(network for network, _ in VARIANTS.values()), DepthNet)}
+    networks: list[type[BevModel]] = [*(network for network, _ in VARIANTS.values()), DepthNet]
+    classes = {network.__name__: network for network in networks}
     name = description(path)["class"]
     if name not in classes:
         raise InputError(f"{path}: expected a checkpoint of {', '.join(classes)}, found one of {name}")

@@ -62,7 +62,9 @@ def torchvision_name(name: str) -> str:
     if name.startswith("embedder.embedder."):
         module, kind = name.split(".")[-2:]
         return f"{'conv1' if module == 'convolution' else 'bn1'}.{kind}"
-    stage, block, position, module, kind = _BLOCK.fullmatch(name).groups()
+    found = _BLOCK.fullmatch(name)
+    assert found, f"{name}: expected a weight of a ResNet"
+    stage, block, position, module, kind = found.groups()
     is_convolution = module == "convolution"
     if position is None:
         layer = f"downsample.{0 if is_convolution else 1}"
@@ -73,7 +75,10 @@ def torchvision_name(name: str) -> str:
 
 def _stage(name: str) -> int:
     """The stage, from 0, that a weight belongs to in either naming; -1 for the stem and whatever is no weight."""
-    ours, torchvisions = found.groups() if (found := _STAGE.search(name)) else ("-1", None)
+    found = _STAGE.search(name)
+    if found is None:
+        return -1
+    ours, torchvisions = found.groups()
     return int(ours) if ours else int(torchvisions) - 1
 
 

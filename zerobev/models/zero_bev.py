@@ -6,6 +6,8 @@ zero-shot  -> zero CNN --'                                                      
      '------- P^-1 with depth, max-pooling to the ground -> embedding  (residual) .......'
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -47,13 +49,14 @@ class ZeroBEV(BevModel):
         self.check_inputs(rgb, zero, depth)
         images = [zero]  # and what else belongs to each of them
         if self.config.residual:
+            assert depth is not None  # as checked
             images.append(project(zero, depth, self.camera))
         rgb_maps = self.backbone(rgb)
         parts = zip(*(image.split(max(1, IMAGES_A_PASS // len(zero)), dim=1) for image in images))
         logits = torch.cat([self.pass_images(rgb_maps, *part) for part in parts], dim=1)  # B K 1+aux M M
         return Projection(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None)
 
-    def pass_images(self, rgb_maps: tuple[Tensor, ...], zero: Tensor, projected: Tensor | None = None) -> Tensor:
+    def pass_images(self, rgb_maps: Sequence[Tensor], zero: Tensor, projected: Tensor | None = None) -> Tensor:
         """Maps of B photographs, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).
 
         projected: (B, K, M, M), P^-1 of these images, in the residual variant
@@ -63,7 +66,7 @@ class ZeroBEV(BevModel):
             features = features + self.embedding(projected.flatten(0, 1)[:, None])
         return self.decoder(features).unflatten(0, zero.shape[:2])
 
-    def fpv_maps(self, rgb_maps: tuple[Tensor, ...], zero: Tensor) -> list[Tensor]:
+    def fpv_maps(self, rgb_maps: Sequence[Tensor], zero: Tensor) -> list[Tensor]:
         """Concatenate the photograph's maps with those of each zero-shot image, (B * K, channels, R_b, C_b)."""
         zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])
         shared = [features.repeat_interleave(zero.shape[1], 0) for features in rgb_maps]

@@ -124,7 +124,8 @@ def _photograph_primitives(scene: Scene) -> Iterator[Primitive]:
     """One primitive a mesh, placed in the world."""
     encoded: dict[int, bytes] = {}
     for index, (mesh, positions, faces) in enumerate(placed_meshes(scene.photograph)):
-        uv, colors, image, factor, double_sided = None, None, None, (1.0, 1.0, 1.0, 1.0), scene.double_sided
+        uv, colors, image, double_sided = None, None, None, scene.double_sided
+        factor: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
         if mesh.visual.kind == "texture":
             material = mesh.visual.material
             material = material.to_pbr() if isinstance(material, trimesh.visual.material.SimpleMaterial) else material

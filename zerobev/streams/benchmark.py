@@ -76,7 +76,7 @@ def measure_views(folders: list[Path], setting: Scale, repeats: int, seconds: fl
     for workers in WORKERS:
         jobs = (joblib.delayed(view_rates)(folder, setting, repeats, seconds) for folder in folders[:workers])
         set_up, rates = zip(*joblib.Parallel(n_jobs=workers)(jobs))
-        wall, processor = np.moveaxis(rates, -1, 0)
+        wall, processor = np.moveaxis(np.array(rates), -1, 0)
         measured[str(workers)] = spread(wall.sum(axis=0)) | {
             "set_up_s": float(np.median(set_up)),
             "per_processor_s": float(np.median(processor)),
@@ -153,8 +153,8 @@ def rerender(
     if textured:
         return zero, rerenderer.bev(pose)
     zero = random_rectangles(depth.shape, rng)
-    image, depth = (torch.from_numpy(np.ascontiguousarray(of, np.float32))[None, None] for of in (zero, depth))
-    return zero, project(image, depth, camera)[0, 0].numpy()
+    images, depths = (torch.from_numpy(np.ascontiguousarray(of, np.float32))[None, None] for of in (zero, depth))
+    return zero, project(images, depths, camera)[0, 0].numpy()
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:

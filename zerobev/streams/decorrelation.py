@@ -95,7 +95,8 @@ def dependence(
     coins[0] = 0  # nothing exchanged: the data as they are
     as_tossed = _measured(np.array(own), np.array(exchanged), coins)
     the_other_way = _measured(np.array(own), np.array(exchanged), 1 - coins)
-    return tuple(Measure(a[0], b[0], a[1:] - b[1:]) for a, b in zip(as_tossed, the_other_way))
+    bits, auc = (Measure(a[0], b[0], a[1:] - b[1:]) for a, b in zip(as_tossed, the_other_way))
+    return bits, auc
 
 
 def _measured(own: np.ndarray, exchanged: np.ndarray, coins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,8 +172,8 @@ def colour_of_cells(rgb: torch.Tensor, depth: torch.Tensor, camera: CameraConfig
     rgb: (B, 3, H, W) in [0, 1]; depth: (B, 1, H, W), metres: pixels are put on the map as in P^-1.
     """
     cells = camera.bev_px**2
-    place = cells_of_pixels(depth[:, 0], camera).flatten(1)
-    place = (place + torch.arange(len(place))[:, None] * (cells + 1)).flatten().numpy()
+    cell = cells_of_pixels(depth[:, 0], camera).flatten(1)
+    place = (cell + torch.arange(len(cell))[:, None] * (cells + 1)).flatten().numpy()
     pixels = np.bincount(place, minlength=len(rgb) * (cells + 1))
     step = np.zeros(len(pixels), np.int64)
     for channel in rgb.unbind(1):

@@ -72,12 +72,12 @@ def fov_mask(depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
     side = camera.bev_px
     reached = np.zeros(side * side + 1, bool)
     reached[cells_of_pixels(torch.from_numpy(depth), camera).numpy()] = True
-    reached = reached[:-1].reshape(side, side)
-    row = np.flatnonzero(reached.any(axis=1))
+    on_map = reached[:-1].reshape(side, side)
+    row = np.flatnonzero(on_map.any(axis=1))
     if not len(row):
         return np.zeros((side, side), bool)
     # the hull is that of the first and the last cell of each row
-    ends = reached[row].argmax(axis=1), side - reached[row, ::-1].argmax(axis=1)
+    ends = on_map[row].argmax(axis=1), side - on_map[row, ::-1].argmax(axis=1)
     corners = np.concatenate([np.stack([column, row + dy], axis=1) for column in ends for dy in (0, 1)])
     planes = ConvexHull(corners).equations  # (edges, 3): a x + b y + c <= 0 inside
     centre = np.stack(np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5), axis=-1)

@@ -140,7 +140,7 @@ def triangle(u: Array, v: Array, s: Callable[[Array, Array], Array]) -> Array:
 
 def ripples(rng: Rng, size: int) -> Array:
     """Circular waves from several centres, superposed."""
-    return sum(np.cos(2 * np.pi * polar(rng, size)[0] * 1.5) for _ in range(4))
+    return sum((np.cos(2 * np.pi * polar(rng, size)[0] * 1.5) for _ in range(4)), np.zeros((size, size)))
 
 
 def turbulence(rng: Rng, size: int) -> Array:
@@ -242,7 +242,7 @@ FIELDS = {
     "discs": discs,
     "scratches": scratches,
 }
-KINDS = tuple((*PLANE, *POLAR, *CELLS, *FIELDS))
+KINDS = (*PLANE, *POLAR, *CELLS, *FIELDS)
 
 
 def procedural(kind: str, rng: Rng, size: int) -> Array:
@@ -285,14 +285,19 @@ class SourceImages:
     def __init__(self, dtd: Path | None = None, size: int = 96) -> None:
         """`size`: side of a pattern, pixels."""
         if dtd is None:
-            self._kinds = [partial(procedural, kind, size=size) for kind in KINDS]
-            self._kinds += [lambda rng, name=name: photograph(name) for name in PHOTOGRAPHS]
+            self._kinds: list[Callable[[Rng], Array]] = [partial(procedural, kind, size=size) for kind in KINDS]
+            self._kinds += [_fixed(partial(photograph, name)) for name in PHOTOGRAPHS]
             return
         files = sorted(Path(dtd).glob("images/*/*.jpg"))
         if not files:
             raise InputError(f"{dtd}: expected a folder with images/<category>/*.jpg, found none")
-        self._kinds = [lambda rng, file=file: read_grey(file) for file in files]
+        self._kinds = [_fixed(partial(read_grey, file)) for file in files]
 
     def draw(self, rng: Rng) -> Array:
         """A random source: (h, w) float32 in [0, 1]."""
         return self._kinds[rng.integers(len(self._kinds))](rng)
+
+
+def _fixed(read: Callable[[], Array]) -> Callable[[Rng], Array]:
+    """A kind that is one image: nothing of it is drawn."""
+    return lambda _: read()

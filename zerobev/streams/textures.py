@@ -146,7 +146,7 @@ def _opened_source(
 
 
 def _random_kernel(kernel_px: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    return kernel_runs(KERNELS[rng.integers(len(KERNELS))], rng.integers(kernel_px[0], kernel_px[1] + 1))
+    return kernel_runs(KERNELS[rng.integers(len(KERNELS))], int(rng.integers(kernel_px[0], kernel_px[1] + 1)))
 
 
 def _dilated_until(
@@ -159,12 +159,12 @@ def _dilated_until(
     """
     while np.count_nonzero(mask) < white:
         shape = KERNELS[rng.integers(len(KERNELS))]
-        size = rng.integers(kernel_px[0], kernel_px[1] + 1)
+        size = int(rng.integers(kernel_px[0], kernel_px[1] + 1))
         dilated = dilate(mask, kernel_runs(shape, size), wrap)
         if np.count_nonzero(dilated) <= white:
             mask = dilated
             continue
-        sizes, results = [1, int(size)], [mask, dilated]
+        sizes, results = [1, size], [mask, dilated]
         while sizes[1] - sizes[0] > 1:
             few, many = map(np.count_nonzero, results)
             guess = int(np.interp(white, (few, many), sizes))  # the white grows almost evenly with the size

@@ -20,7 +20,7 @@ from zerobev.streams.shards import Shard
 from zerobev.streams.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.streams.views import View
 
-Sample = dict[str, np.ndarray]
+Sample = dict[str, np.ndarray | np.int64]
 #: The images of K modalities in FPV (K, H, H) and the same on the map (K, M, M), bool or float.
 Pair = tuple[np.ndarray, np.ndarray]
 #: Texels of 1 cm, as many as int16 has, after which a plan repeats; the world's origin is in the middle.
@@ -162,7 +162,8 @@ class SynthTuples(TupleStream):
         texels = view.fpv_texel, view.bev_texel
         if rng.random() < self._upright:
             texels = painted_from_above(view, self._camera, shard.charts)
-        return tuple(self._bank.look_up(image, draw)[None] for image in texels)
+        zero, target = (self._bank.look_up(image, draw)[None] for image in texels)
+        return zero, target
 
 
 def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np.ndarray, np.ndarray]:
@@ -185,7 +186,8 @@ def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np
         plan = np.full(texel.shape, chart, np.int32)
         plan[..., 1:] = np.floor(100 * world + _PLAN_TEXELS / 2).reshape(*texel.shape[:2], 2)
         painted.append(np.where(raised[..., None], plan & (_PLAN_TEXELS - 1), texel).astype(np.int16))
-    return tuple(painted)
+    fpv, bev = painted
+    return fpv, bev
 
 
 class ModSemTuples(TupleStream):

@@ -86,9 +86,9 @@ def train(
         error = stream(columns.features[some], values[some]) - target[some]
         loss = error[columns.gamma[some].any(-1)].square().mean()
         if step % _EVERY == 0:
-            measured = divergence(net, Columns(*(part[:_MEASURED] for part in columns)))
-            for noted, value in zip(progress, (step, float(loss.detach()), measured)):
-                noted.append(value)
+            progress.step.append(step)
+            progress.loss.append(float(loss.detach()))
+            progress.divergence.append(divergence(net, Columns(*(part[:_MEASURED] for part in columns))))
         if step < steps:
             adam.zero_grad()
             loss.backward()

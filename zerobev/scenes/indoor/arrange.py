@@ -132,6 +132,8 @@ def lounge(space: Space) -> Placed | None:
             table = tables.side_table(rng)
             t = sofa.along + side * (float(sofa.piece.bounds[1, 0]) + 0.3)
             stand = space.at_wall(table, sofa.side, t)
+            if stand is None:
+                continue
             for lamp in space.on_top(stand, (clutter.table_lamp, clutter.vase), 1):
                 if lamp.piece.items[0][0] == "table lamp":
                     _shine(space, lamp, float(stand.piece.tops[0].z + lamp.piece.bounds[1, 2] + 0.08), 0.3)

@@ -169,7 +169,8 @@ def _rooms(rng: np.random.Generator, rectangles: list[Rectangle], footprint: Rec
     height = rng.uniform(2.4, 2.65)
     rooms = []
     for kind, outer in named:
-        outside = tuple(abs(outer[i] - footprint[i]) < 1e-9 for i in (1, 2, 3, 0))
+        west, south, east, north = (abs(a - b) < 1e-9 for a, b in zip(outer, footprint))
+        outside = south, east, north, west
         inset = [OUTER_M if o else INNER_M for o in outside]
         inner = (outer[0] + inset[3], outer[1] + inset[0], outer[2] - inset[1], outer[3] - inset[2])
         rooms.append(Room(str(kind), outer, inner, outside, float(height)))
@@ -213,7 +214,7 @@ def _doors(rng: np.random.Generator, rooms: list[Room]) -> list[tuple[int, int, 
 
 def _windows(rng: np.random.Generator, room: Room) -> list[Opening]:
     """At most one window (two on long walls) in each outer wall; a kitchen needs walls and has one only."""
-    windows = []
+    windows: list[Opening] = []
     for side in range(4):
         axis = 0 if side in (0, 2) else 1
         start, end = room.inner[axis], room.inner[axis + 2]

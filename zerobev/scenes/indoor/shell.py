@@ -99,8 +99,9 @@ def _door_leaf(rng: np.random.Generator, room: Room, opening: Opening, trim: Mat
 def _window(rng: np.random.Generator, start: float, end: float, sill: float, trim: Material) -> Solid:
     """A bright pane deep in the wall, its frame, and a sill board."""
     back = -OUTER_M + 0.02
-    sky = tuple(float(np.clip(c * rng.uniform(0.85, 1.05), 0, 1)) for c in _SKY)
-    solid = Solid().box((start, end), (back, back + 0.02), (sill, HEAD_M), surfaces.glowing(sky), hide="brlt")
+    red, green, blue = (float(np.clip(c * rng.uniform(0.85, 1.05), 0, 1)) for c in _SKY)
+    sky = surfaces.glowing((red, green, blue))
+    solid = Solid().box((start, end), (back, back + 0.02), (sill, HEAD_M), sky, hide="brlt")
     bars = 1 + (end - start > 0.9) * int(rng.integers(1, 3))
     face = (back + 0.02, back + 0.06)
     for z in ((sill, sill + 0.05), (HEAD_M - 0.05, HEAD_M)):

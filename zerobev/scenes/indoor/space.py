@@ -152,7 +152,7 @@ class Space:
         """Stand a piece with its back to a wall, not before a window that it would cover."""
         (x0, _, _), (x1, _, _) = piece.bounds
         for _ in range(_TRIES):
-            side = sides[self.rng.integers(len(sides))]
+            side = sides[int(self.rng.integers(len(sides)))]
             length = side_frame(self.room, side)[2]
             low, high = margin - x0, length - margin - x1
             if high < low:
@@ -248,7 +248,7 @@ class Space:
         if placed is None or not placed.piece.tops:
             return done
         for _ in range(count):
-            piece = designs[self.rng.integers(len(designs))](self.rng)
+            piece = designs[int(self.rng.integers(len(designs)))](self.rng)
             top = placed.piece.tops[self.rng.integers(len(placed.piece.tops))]
             (x0, y0, _), (x1, y1, height) = piece.bounds
             if x1 - x0 > top.x[1] - top.x[0] or y1 - y0 > top.y[1] - top.y[0] or height > top.room:

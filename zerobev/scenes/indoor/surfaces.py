@@ -136,7 +136,8 @@ def _hsv(hue: float, saturation: float, value: float) -> Color:
 
 
 def _shade(color: Color, factor: float) -> Color:
-    return tuple(min(1.0, factor * c) for c in color)
+    red, green, blue = (min(1.0, factor * c) for c in color)
+    return red, green, blue
 
 
 def two_tone(pattern: str, color: Color, factor: float = 0.8) -> Material:

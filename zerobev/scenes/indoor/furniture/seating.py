@@ -63,7 +63,8 @@ def shell_chair(rng: np.random.Generator) -> Piece:
         (-w / 2 * 0.9, w / 2 * 0.9), (0.08, 0.11), (h, rng.uniform(0.76, 0.85)), skin, lean=(0, -0.08), taper=0.85
     )
     for x in (-1, 1):
-        solid.box(tuple(sorted((x * w * 0.45, x * w * 0.49))), (0.11, w * 0.7), (h, h + 0.16), skin, taper=0.7)
+        left, right = sorted((x * w * 0.45, x * w * 0.49))
+        solid.box((left, right), (0.11, w * 0.7), (h, h + 0.16), skin, taper=0.7)
     return one("chair", solid)
 
 
