@@ -67,10 +67,13 @@ def test_verdict_on_one_class_looks_at_that_class():
     assert found == {"floor": "holds", "bed": "does not hold", "wall": "undecided", "objects": "does not hold"}
 
 
-def test_verdict_is_on_the_mean_over_seeds():
+@pytest.mark.parametrize("gains, expected", [((9, 3), "holds"), ((9, -3), "undecided"), ((-9, -3), "does not hold")])
+def test_verdict_is_on_all_seeds(gains, expected):
     base = np.full((6, 8), 30.0)
-    records = [record("c", base), record("d", base + 9, seed=0), record("d", base - 3, seed=1)]
-    assert judge(CLAIM, records).ours == pytest.approx(3)
+    records = [record("c", base), *(record("d", base + gain, seed=seed) for seed, gain in enumerate(gains))]
+    verdict = judge(CLAIM, records)
+    assert verdict.ours == pytest.approx(np.mean(gains)) and verdict.verdict == expected
+    assert (verdict.low, verdict.high) == (min(gains), max(gains))
 
 
 def test_records_of_other_rows_change_nothing():

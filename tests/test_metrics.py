@@ -206,16 +206,23 @@ def test_difference_is_paired():
     assert alone[1] - alone[0] > 0.03
 
 
-def test_seeds_are_averaged():
-    """Two seeds whose errors cancel in every scene have an interval of no width; classes keep their axis."""
+def test_seeds_are_drawn_and_averaged():
+    """Seeds at .4, .5 and .6 in every scene: 1 mean of three in 27 is .4, below 5 %, 4 in 27 are .433 or less."""
     rng = np.random.default_rng(2)
-    one = scenes_with(rng, 0.5)
-    other = Counts(1000 - one.intersection, one.union)
-    low, high = bootstrap_interval([one, other], iou_per_class, rng)
-    assert low.shape == (1,)
-    assert (low[0], high[0]) == (pytest.approx(0.5), pytest.approx(0.5))
+    seeds = [Counts(np.full((6, 2), cells), np.full((6, 2), 1000)) for cells in (400, 500, 600)]
+    low, high = bootstrap_interval(seeds, iou_per_class, rng, draws=4000)
+    assert low == pytest.approx([1.3 / 3] * 2) and high == pytest.approx([1.7 / 3] * 2)  # classes keep their axis
+    ((mean,), (alone,)) = (resampled_scenes([counts], class_iou, rng, 4000) for counts in (seeds, seeds[:1]))
+    assert mean.mean() == pytest.approx(0.5, abs=0.003) and np.unique(alone) == pytest.approx([0.4])
     with pytest.raises(InputError, match="expected the same scenes"):
-        bootstrap_interval([one, Counts.empty(3, 1)], class_iou, rng)
+        bootstrap_interval([seeds[0], Counts.empty(3, 2)], class_iou, rng)
+
+
+def test_seeds_of_two_rows_are_drawn_apart():
+    """Each row's two seeds are .4 and .6: the difference is -.2, -.1, 0, .1 or .2, though both have the same seeds."""
+    seeds = [Counts(np.full((6, 1), cells), np.full((6, 1), 1000)) for cells in (400, 600)]
+    first, second = resampled_scenes([seeds, seeds], pixel_iou, np.random.default_rng(5), 2000)
+    assert np.unique((first - second).round(3)) == pytest.approx([-0.2, -0.1, 0, 0.1, 0.2])
 
 
 def test_interval_is_reproducible():

@@ -66,6 +66,14 @@ def test_the_page_of_results_says_what_the_records_say():
         pd.testing.assert_frame_equal(written, table(number, records), check_dtype=False)
 
 
+def test_the_readme_says_what_the_records_say():
+    results = table(1, recorded(EXPERIMENTS, Workspace("reduced")))[["class avg.", "pixel avg."]].unstack("source")
+    readme = (ROOT / "README.md").read_text()
+    for (row, method), values in results.iterrows():
+        cells = [f"{values[iou, 'ours']:.1f} ({values[iou, 'paper']:.1f})" for iou in ("class avg.", "pixel avg.")]
+        assert f"| ({row}) | {method} | {cells[0]} | {cells[1]} |" in readme
+
+
 def test_published_numbers_are_those_that_were_checked():
     numbers = {
         number: {name: [*row.per_class, row.class_iou, row.pixel_iou] for name, row in rows.items()}

@@ -1,7 +1,7 @@
 """The paper's claims held against our records: holds, does not hold, or undecided - computed, never typed.
 
 What is judged is the order of rows, the sign of a gain, the spread of several rows; not absolute numbers, since the
-scenes differ. A verdict stands on means over seeds with a 90 % bootstrap interval over test scenes.
+scenes differ. A verdict stands on means over seeds with a 90 % bootstrap interval over test scenes and seeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ class Verdict:
     claim: str
     paper: float | None  #: IoU points; None where the paper has no such row
     ours: float | None
-    low: float | None  #: 90 % interval over test scenes
+    low: float | None  #: 90 % interval over test scenes and seeds
     high: float | None
     verdict: str  #: "holds", "does not hold", "undecided", or "not run"
 

@@ -117,7 +117,7 @@ def flat(masks: np.ndarray) -> np.ndarray:
 
 
 def averages_figure(number: int, records: Sequence[Record]) -> Figure:
-    """Both averages of each row of a table: ours with 90 % intervals over test scenes, the paper's as crosses."""
+    """Both averages of each row of a table: ours with 90 % intervals over scenes and seeds, the paper's as crosses."""
     rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
     figure, panels = plt.subplots(1, 2, figsize=(8, 0.9 + 0.28 * len(rows)), sharey=True)
     for axes, (name, statistic) in zip(panels, {"class": class_iou, "pixel": pixel_iou}.items()):

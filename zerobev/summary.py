@@ -117,7 +117,7 @@ def _scoreboard(verdicts: Sequence[Verdict]) -> str:
     ]
     return (
         f"<h2>Claims</h2><p>The paper's {sum(paper.values())} claims - {counted}. Differences in IoU points, means "
-        "over seeds, intervals from resampling test homes; claims without a number of the paper are ours.</p>"
+        "over seeds, intervals from resampling test homes and seeds; claims without a number of the paper are ours.</p>"
         f"<table><tr>{heads}</tr>{''.join(lines)}</table>"
     )
 

@@ -127,7 +127,7 @@ def count(predicted: Tensor, target: Tensor, fov: Tensor, scene: Tensor, scenes:
 def bootstrap_interval(
     counts: Sequence[Counts], statistic: Statistic, rng: np.random.Generator, level: float = 0.9, draws: int = 1000
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Percentile interval of the statistic's mean over seeds, from resampling test scenes with replacement.
+    """Percentile interval of the statistic's mean over seeds, from resampling test scenes and seeds with replacement.
 
     counts: one a seed, of the same scenes; every draw takes the same scenes from all of them
     statistic: `class_iou`, `pixel_iou` or `iou_per_class`, or another function of (..., K) counts
@@ -141,17 +141,21 @@ def bootstrap_interval(
 def resampled_scenes(
     rows: Sequence[Sequence[Counts]], statistic: Statistic, rng: np.random.Generator, draws: int
 ) -> list[np.ndarray]:
-    """The statistic's mean over seeds of several rows, (draws, ...) each, under resampling of test scenes.
+    """The statistic's mean over seeds of several rows, (draws, ...) each, under resampling of test scenes and of seeds.
 
     rows: counts of each row, one a seed, all of the same scenes. They are paired: draw i takes the same scenes from
-    all rows and seeds, so that differences and quotients of rows have intervals of their own.
+    all rows and seeds, so that differences and quotients of rows have intervals of their own. Seeds are drawn for each
+    row by itself, as trainings are: what another training might have undone is then not certain. Of three seeds that
+    is a rough measure, and of one none at all.
     """
     scenes = {len(one.union) for counts in rows for one in counts}
     if len(scenes) != 1 or 0 in scenes:
         raise InputError(f"counts: expected the same scenes in all, found {sorted(scenes)} scenes")
     (size,) = scenes
     weights = rng.multinomial(size, np.full(size, 1 / size), size=draws)  # how often each scene is in each draw
-    return [
-        np.mean([statistic(weights @ one.intersection, weights @ one.union) for one in counts], axis=0)
-        for counts in rows
-    ]
+    means = []
+    for counts in rows:
+        values = np.stack([statistic(weights @ one.intersection, weights @ one.union) for one in counts])
+        drawn = rng.integers(len(counts), size=values.shape[:2])
+        means.append(values[drawn, np.arange(draws)].mean(axis=0))
+    return means
