@@ -107,6 +107,7 @@ $(READY): environment.txt pyproject.toml
 	mv .venv/.unfinished $@
 
 define OPEN_EGL
+import zerobev.sensors
 import pyrender
 scene = pyrender.Scene()
 scene.add(pyrender.PerspectiveCamera(yfov=1.0))

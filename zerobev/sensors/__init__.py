@@ -1,0 +1,13 @@
+"""What a camera and the map see of a scene. Importing it prepares for pyrender, which no file here imports before."""
+
+import os
+
+import numpy as np
+
+# pyrender chooses its platform on import: without this it looks for a window
+os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+# it imports pyglet, for a viewer that is not used here, and pyglet fails where only a part of X11 is installed
+os.environ.setdefault("PYGLET_HEADLESS", "true")
+# pyrender 0.1.45 still asks for the spelling that NumPy 2 removed
+if not hasattr(np, "infty"):
+    vars(np)["infty"] = np.inf

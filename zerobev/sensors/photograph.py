@@ -2,21 +2,13 @@
 
 import atexit
 import functools
-import os
 from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
+import pyrender
 import trimesh
 from PIL import Image
-
-# pyrender chooses its platform on import: without this it looks for a window
-os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-# pyrender 0.1.45 still asks for the spelling that NumPy 2 removed
-if not hasattr(np, "infty"):
-    vars(np)["infty"] = np.inf
-
-import pyrender
 
 from zerobev.config import CameraConfig
 from zerobev.scenes.scene import Scene
