@@ -61,7 +61,7 @@ MUTATIONS = (
     ),
     Mutation(
         "one cell less in a smoke record",
-        "reports/smoke/records/c-seed0-*.json",
+        "reports/smoke/records/b.2-seed0-*.json",
         re.compile(r'"intersection": \[\[\d+'),
         _one_less,
         _RECORDS,
