@@ -11,3 +11,8 @@ os.environ.setdefault("PYGLET_HEADLESS", "true")
 # pyrender 0.1.45 still asks for the spelling that NumPy 2 removed
 if not hasattr(np, "infty"):
     vars(np)["infty"] = np.inf
+
+from OpenGL.plugins import FormatHandler
+
+# PyOpenGL 3.1.0, which pyrender asks for, knows a reference to a C value by the name that it had before Python 3.12
+FormatHandler("ctypesparameter", "OpenGL.arrays.ctypesparameters.CtypesParameterHandler", ["_ctypes.CArgObject"])
