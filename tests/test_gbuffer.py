@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from OpenGL.plugins import FormatHandler
 from PIL import Image
 from scenes_for_tests import TEXEL_M, box, build, furnished, real_home, room
 from scipy import ndimage
@@ -327,3 +328,10 @@ def test_photographers_of_two_scenes_and_sizes_take_turns():
     for _ in range(2):
         for photographer, expected in zip(pair, alone):
             assert np.array_equal(photographer.take(POSES[0]), expected)
+
+
+def test_photographs_need_no_window_and_no_python_before_3_12():
+    """What pyrender and the PyOpenGL that it pins would do by themselves fails on a bare Debian and on Python 3.12."""
+    assert photograph.pyrender.viewer.pyglet.options.headless
+    renamed = type("CArgObject", (), {"__module__": "_ctypes"})  # as Python 3.12 calls what `ctypes.byref` gives
+    assert FormatHandler.match(renamed) is not None

@@ -37,7 +37,7 @@ class Record:
     seed: int
     config: dict[str, Any]  #: everything the run depends on; its fingerprint is part of the key
     origin: dict[str, Any]  #: git revision, versions, device
-    cost: dict[str, float]  #: seconds of training and evaluation, peak memory in MB
+    cost: dict[str, float]  #: seconds of training and evaluation; the process's peak memory so far, MB
     scenes: list[str]  #: test scenes, in the order of the counts
     counts: Counts
     history: dict[str, list[float | None]]  #: training curves by name, empty for a method that is not trained

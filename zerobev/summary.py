@@ -81,7 +81,7 @@ def write_summary(workspace: Workspace) -> Path:
         "<h2>What it looks like</h2>",
         _gallery(workspace, records),
         *_any_modality(workspace),
-        "<h2>Runs</h2>",
+        "<h2>Runs</h2><p>Memory is the peak of the process so far, which may have computed other rows before.</p>",
         cost_table(records).to_html(border=0),
     ]
     page = folder / "index.html"
