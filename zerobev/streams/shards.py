@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, fields
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import hdf5plugin
 import numpy as np
 
 from zerobev.config import CameraConfig, TextureConfig
@@ -35,8 +37,8 @@ def write_shard(
             if index == 0:
                 record = np.dtype([(name, value.dtype, value.shape) for name, value in zip(_FIELDS, values)])
                 # One record and one chunk a view: a training sample reads one view at random, in one call.
-                # Not lzf: what it writes for the same views differs from time to time.
-                storage = {"maxshape": (None,), "chunks": (1,), "compression": "gzip", "compression_opts": 1}
+                # Not lzf: what it writes for the same views differs from time to time. Gzip reads three times slower.
+                storage = {"maxshape": (None,), "chunks": (1,), "compression": hdf5plugin.Zstd(clevel=3)}
                 table = file.create_dataset("views", (0,), record, **storage)
             table.resize(index + 1, axis=0)
             table[index] = np.array(values, record)
@@ -57,7 +59,7 @@ def _while_there_is_room(views: Iterable[View], folder: Path) -> Iterator[View]:
 
 
 class Shard:
-    """Reads a shard. The file is opened on first use, so that a `Shard` may travel to a worker process.
+    """Reads a shard. Each process opens the file on its first use, so that a `Shard` may travel to workers.
 
     Raises `InputError` for a file that is missing, damaged, or recorded with another camera or *Mod. Sem.* share.
     """
@@ -78,6 +80,7 @@ class Shard:
         if found != expected:
             raise InputError(f"{path}: expected views recorded with {expected}, found {found}")
         self._views: h5py.Dataset | None = None
+        self._opened_by = 0  # the process; one that was forked off must not use the file of its parent
 
     def __len__(self) -> int:
         return self._length
@@ -88,8 +91,9 @@ class Shard:
     def view(self, index: int) -> View:
         """View number `index`."""
         try:
-            if self._views is None:
-                self._views = h5py.File(self.path)["views"]
+            if self._views is None or self._opened_by != os.getpid():
+                # without a cache of chunks: a view is read once an epoch, and HDF5 would keep megabytes of every shard
+                self._views, self._opened_by = h5py.File(self.path, rdcc_nbytes=0)["views"], os.getpid()
             record = np.empty(1, self._views.dtype)
             place = self._views.id.get_space()
             place.select_hyperslab((index,), (1,))
