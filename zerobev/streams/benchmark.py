@@ -28,7 +28,7 @@ from zerobev.scenes.scene import Scene
 from zerobev.sensors.cameras import Pose
 from zerobev.sensors.rerender import Rerenderer
 from zerobev.storage import write_json
-from zerobev.streams.projection import project
+from zerobev.streams.projection import project_mask
 from zerobev.streams.shards import Shard, write_shard
 from zerobev.streams.textures import TextureBank, modsem_textures, random_rectangles
 from zerobev.streams.tuples import DepthProjTuples, ModSemTuples, SynthTuples, TupleStream, ViewSet
@@ -153,8 +153,7 @@ def rerender(
     if textured:
         return zero, rerenderer.bev(pose)
     zero = random_rectangles(depth.shape, rng)
-    images, depths = (torch.from_numpy(np.ascontiguousarray(of, np.float32))[None, None] for of in (zero, depth))
-    return zero, project(images, depths, camera)[0, 0].numpy()
+    return zero, project_mask(zero, np.ascontiguousarray(depth, np.float32), camera)
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:

@@ -12,7 +12,17 @@ from scipy.spatial import ConvexHull
 from zerobev.config import CameraConfig
 from zerobev.sensors.cameras import fpv_rays
 
-_rays = cache(fpv_rays)
+
+@cache
+def _slopes(camera: CameraConfig) -> np.ndarray:
+    """(H,) float64: how far to the right a column looks, and a row down, at depth 1."""
+    return fpv_rays(camera)[0, :, 0]
+
+
+def map_coordinates(depth: torch.Tensor, camera: CameraConfig) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The coordinates of `map_points`, an array (..., H, W) each: x to the right, y forward, z above the floor."""
+    slopes = torch.as_tensor(_slopes(camera), dtype=depth.dtype, device=depth.device)
+    return slopes * depth, depth, camera.height_m - slopes[:, None] * depth
 
 
 def map_points(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
@@ -20,8 +30,7 @@ def map_points(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
 
     depth: (..., H, W) planar depth, metres. Returns (..., H, W, 3) of the same dtype, metres.
     """
-    rays = torch.as_tensor(_rays(camera), dtype=depth.dtype, device=depth.device)
-    return torch.stack([rays[..., 0] * depth, depth, camera.height_m - rays[..., 1] * depth], dim=-1)
+    return torch.stack(map_coordinates(depth, camera), dim=-1)
 
 
 def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
@@ -30,7 +39,7 @@ def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
     depth: (..., H, W) planar depth, metres, 0 for nothing seen. Points above `max_height_m` reach no cell.
     Returns (..., H, W) int64.
     """
-    x, y, z = map_points(depth, camera).unbind(-1)
+    x, y, z = map_coordinates(depth, camera)
     side = camera.bev_px
     column = torch.floor((x + camera.bev_extent_m / 2) / camera.cell_m).long()
     row = side - 1 - torch.floor(y / camera.cell_m).long()
@@ -63,6 +72,16 @@ def project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> to
     return pooled[..., :-1].view(batch, modalities, side, side)
 
 
+def project_mask(mask: np.ndarray, depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
+    """P^-1 of one binary image: the cells that some white pixel falls into; as `project`, and several times faster.
+
+    mask: (H, W) bool; depth: (H, W) float, metres. Returns (M, M) bool.
+    """
+    hit = np.zeros(camera.bev_px**2 + 1, bool)
+    hit[cells_of_pixels(torch.from_numpy(depth), camera).numpy()[mask]] = True
+    return hit[:-1].reshape(camera.bev_px, camera.bev_px)
+
+
 def fov_mask(depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
     """(M, M) bool: cells with their centre in the convex hull of all cells that the depth image reaches.
 
@@ -70,9 +89,7 @@ def fov_mask(depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
     cell in the mask, since the hull is that of the cells' corners.
     """
     side = camera.bev_px
-    reached = np.zeros(side * side + 1, bool)
-    reached[cells_of_pixels(torch.from_numpy(depth), camera).numpy()] = True
-    on_map = reached[:-1].reshape(side, side)
+    on_map = project_mask(np.ones_like(depth, bool), depth, camera)
     row = np.flatnonzero(on_map.any(axis=1))
     if not len(row):
         return np.zeros((side, side), bool)

@@ -292,13 +292,14 @@ class TextureBank:
         first = draw.tile * side**2 + ((side - 1) * stride * draw.flip).sum(axis=1)
         stride = np.where(draw.flip, -stride, stride)
 
-        chart = texels[..., 0].astype(np.intp)
-        index = first[chart]
-        for axis in (0, 1):
-            place = texels[..., 1 + axis].astype(np.int32)
+        chart, *places = np.ascontiguousarray(np.moveaxis(texels, -1, 0))
+        chart = chart.astype(np.intp)
+        index = first.take(chart, mode="wrap")  # this mode alone does not copy
+        for axis, place in enumerate(places):
             if draw.scale != 1:
-                place = (place * draw.scale).astype(np.int32)
-            place += draw.offset[:, axis][chart]
+                place = place * draw.scale
+            place = place.astype(np.int32)
+            place += draw.offset[:, axis].take(chart, mode="wrap")
             place -= place // side * side  # numpy's % is slower
-            index += place * stride[:, axis][chart]
-        return self.tiles.reshape(-1)[index] & (chart >= 0)
+            index += place * stride[:, axis].take(chart, mode="wrap")
+        return self.tiles.reshape(-1).take(index, mode="wrap") & (chart >= 0)

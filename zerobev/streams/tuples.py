@@ -8,6 +8,7 @@ obstacles and navigable space; `fov` (B, 1, M, M) mask; `depth` (B, 1, H, H) met
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ import torch
 from zerobev.config import LABELS, CameraConfig
 from zerobev.errors import InputError
 from zerobev.sensors.cameras import Pose, bev_cell_centres
-from zerobev.streams.projection import map_points, project
+from zerobev.streams.projection import map_coordinates, project_mask
 from zerobev.streams.shards import Shard
 from zerobev.streams.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.streams.views import View
@@ -25,6 +26,8 @@ Sample = dict[str, np.ndarray | np.int64]
 Pair = tuple[np.ndarray, np.ndarray]
 #: Texels of 1 cm, as many as int16 has, after which a plan repeats; the world's origin is in the middle.
 _PLAN_TEXELS = 2**15
+
+_cell_centres = cache(bev_cell_centres)
 
 
 class ViewSet:
@@ -162,8 +165,9 @@ class SynthTuples(TupleStream):
         texels = view.fpv_texel, view.bev_texel
         if rng.random() < self._upright:
             texels = painted_from_above(view, self._camera, shard.charts)
-        zero, target = (self._bank.look_up(image, draw)[None] for image in texels)
-        return zero, target
+        white = self._bank.look_up(np.concatenate([image.reshape(-1, 3) for image in texels]), draw)
+        zero, target = np.split(white, [view.depth.size])
+        return zero.reshape(1, *view.depth.shape), target.reshape(1, *view.fov.shape)
 
 
 def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np.ndarray, np.ndarray]:
@@ -172,22 +176,19 @@ def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np
     It takes the place of all that is raised, so that a texture of it is the same all along the vertical. The image's
     surfaces above `max_height_m` stay what they are: below a ceiling is something else.
     """
-    pose = Pose(*view.pose)
-    points = map_points(torch.from_numpy(view.depth), camera).numpy()
-    under_ceiling = np.where(points[..., 2] < camera.max_height_m, points[..., 2], 0)
-    images = (
-        (view.fpv_texel, points[..., :2], under_ceiling),
-        (view.bev_texel, np.stack(bev_cell_centres(camera), axis=-1), view.bev_height),
-    )
-    painted = []
-    for texel, place, height in images:
-        raised = (texel[..., 0] >= 0) & (height > camera.obstacle_m)
-        world = place.reshape(-1, 2) @ pose.world_R_map[:2, :2].T + (pose.x, pose.y)
-        plan = np.full(texel.shape, chart, np.int32)
-        plan[..., 1:] = np.floor(100 * world + _PLAN_TEXELS / 2).reshape(*texel.shape[:2], 2)
-        painted.append(np.where(raised[..., None], plan & (_PLAN_TEXELS - 1), texel).astype(np.int16))
-    fpv, bev = painted
-    return fpv, bev
+    x, y, height = (of.numpy() for of in map_coordinates(torch.from_numpy(view.depth), camera))
+    under_ceiling = np.where(height < camera.max_height_m, height, 0)
+    images = (view.fpv_texel, x, y, under_ceiling), (view.bev_texel, *_cell_centres(camera), view.bev_height)
+    # pixels and cells in one go: of images this small, half the time is the calls
+    texel, x, y, height = (np.concatenate([of.reshape(-1, *of.shape[2:]) for of in both]) for both in zip(*images))
+    raised = (texel[:, 0] >= 0) & (height > camera.obstacle_m)
+    np.copyto(texel[:, 0], np.int16(chart), where=raised)
+    for axis, (right, forward, _) in enumerate(Pose(*view.pose).world_R_map[:2]):
+        plan = 100 * (x * right + y * forward + view.pose[axis]) + _PLAN_TEXELS / 2
+        plan = np.floor(plan, out=plan).astype(np.int32) & (_PLAN_TEXELS - 1)
+        np.copyto(texel[:, 1 + axis], plan.astype(np.int16), where=raised)
+    fpv, bev = np.split(texel, [view.depth.size])
+    return fpv.reshape(view.fpv_texel.shape), bev.reshape(view.bev_texel.shape)
 
 
 class ModSemTuples(TupleStream):
@@ -204,9 +205,8 @@ class DepthProjTuples(TupleStream):
 
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
         """Rectangles in the image, and the cells that a white pixel falls into."""
-        zero = random_rectangles(view.depth.shape, rng)[None]
-        image, depth = torch.from_numpy(zero)[None].float(), torch.from_numpy(view.depth)[None, None]
-        return zero, project(image, depth, self._camera)[0].numpy()
+        zero = random_rectangles(view.depth.shape, rng)
+        return zero[None], project_mask(zero, view.depth, self._camera)[None]
 
 
 class SemanticTuples(TupleStream):
@@ -217,15 +217,26 @@ class SemanticTuples(TupleStream):
         return class_masks(view, self._views.shards[scene].instance_label)
 
 
-def semantic_batches(
-    views: ViewSet, camera: CameraConfig, batch: int, rank: int = 0, ranks: int = 1
-) -> Iterator[dict[str, torch.Tensor]]:
-    """All views once, in order, with the eight classes as modalities (K = 8, in the order of `LABELS`).
+class SemanticPass:
+    """All views once, in order, with the eight classes as modalities (K = 8, in the order of `LABELS`), in batches."""
 
-    With several ranks each gets every `ranks`-th batch.
-    """
-    for first in range(rank * batch, len(views), ranks * batch):
-        yield collate([semantic_sample(views, i, camera) for i in range(first, min(first + batch, len(views)))])
+    def __init__(self, views: ViewSet, camera: CameraConfig, batch: int) -> None:
+        self._views, self._camera, self._batch = views, camera, batch
+
+    def __len__(self) -> int:
+        return -(-len(self._views) // self._batch)
+
+    def batch(self, number: int, rank: int = 0, ranks: int = 1) -> dict[str, torch.Tensor]:
+        """Batch `number`; the last one may be smaller. With several ranks each gets every `ranks`-th of its views."""
+        last = min((number + 1) * self._batch, len(self._views))
+        chosen = range(number * self._batch + rank, last, ranks)
+        return collate([semantic_sample(self._views, i, self._camera) for i in chosen])
+
+
+def semantic_batches(views: ViewSet, camera: CameraConfig, batch: int) -> Iterator[dict[str, torch.Tensor]]:
+    """The batches of a `SemanticPass`, in order."""
+    source = SemanticPass(views, camera, batch)
+    yield from map(source.batch, range(len(source)))
 
 
 def semantic_sample(views: ViewSet, index: int, camera: CameraConfig) -> Sample:
