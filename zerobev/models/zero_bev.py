@@ -69,7 +69,8 @@ class ZeroBEV(BevModel):
     def fpv_maps(self, rgb_maps: Sequence[Tensor], zero: Tensor) -> list[Tensor]:
         """Concatenate the photograph's maps with those of each zero-shot image, (B * K, channels, R_b, C_b)."""
         zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])
-        shared = [features.repeat_interleave(zero.shape[1], 0) for features in rgb_maps]
+        # repeated once, maps would be copied all the same, and lose their layout, channels last
+        shared = rgb_maps if zero.shape[1] == 1 else [maps.repeat_interleave(zero.shape[1], 0) for maps in rgb_maps]
         return [torch.cat(pair, dim=1) for pair in zip(shared, zero_maps)]
 
     def attention(self, rgb: Tensor, zero: Tensor) -> list[BandAttention]:
