@@ -234,6 +234,11 @@ def test_same_seed_same_bytes(unbroken, tmp_path):
     assert files[0] != files[2]
 
 
+def test_workers_that_draw_the_batches_change_no_weight(unbroken, tmp_path):
+    run(tmp_path, workers=2)
+    assert (tmp_path / "best.safetensors").read_bytes() == (unbroken[0] / "best.safetensors").read_bytes()
+
+
 def resume(folder: Path, unbroken: tuple[Path, training.History]) -> list[int]:
     """Go on in `folder`, hold the end against the unbroken run, and return the steps that were trained."""
     asked = []

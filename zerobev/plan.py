@@ -23,7 +23,8 @@ from zerobev.errors import InputError, run_command
 from zerobev.experiments import EXPERIMENTS
 from zerobev.learning.depth import DepthTuples, depth_objective
 from zerobev.learning.evaluate import model_inputs
-from zerobev.learning.train import Objective, Source, dice_objective, training_accelerator
+from zerobev.learning.loader import Source, gpu_workers
+from zerobev.learning.train import Objective, dice_objective, training_accelerator
 from zerobev.models import build
 from zerobev.models.depth import DepthNet
 from zerobev.pretraining import DepthPretraining
@@ -180,8 +181,8 @@ def _network(net: nn.Module, objective: Objective, data: Source, samples: int, t
     process = 2**20 * peak_memory_mb() if device.type == "cpu" else 0
     kept = kept_bytes(lambda: objective(net, batch).total, net)
     _, passed_s = (_seconds(lambda: objective(net, batch).total.backward()) / samples for _ in range(2))
-    # a GPU draws the next batch meanwhile
-    train_s = max(drawn_s, passed_s) if device.type == "cuda" else drawn_s + passed_s
+    # beside a GPU, workers draw the batches to come
+    train_s = max(drawn_s / gpu_workers(), passed_s) if device.type == "cuda" else drawn_s + passed_s
     net.eval()
     with torch.inference_mode():
         test_s = _seconds(lambda: net(*(image.to(device) for image in test)))

@@ -22,8 +22,9 @@ from zerobev.experiments import EXPERIMENTS, Experiment, experiment
 from zerobev.gallery import gallery_indices
 from zerobev.learning.evaluate import Predictor, evaluate, model_predictor, place
 from zerobev.learning.history import History
+from zerobev.learning.loader import Batch, Source, batches
 from zerobev.learning.monitor import maps_figure
-from zerobev.learning.train import Batch, Source, dice_objective, train
+from zerobev.learning.train import dice_objective, train
 from zerobev.models.checkpoint import BevModel
 from zerobev.models.variants import VARIANTS, build
 from zerobev.models.vpn import VPN
@@ -35,11 +36,11 @@ from zerobev.streams.projection import project
 from zerobev.streams.tuples import (
     DepthProjTuples,
     ModSemTuples,
+    SemanticPass,
     SemanticTuples,
     SynthTuples,
     ViewSet,
     collate,
-    semantic_batches,
     semantic_sample,
 )
 from zerobev.workspace import ROOT, Workspace, fingerprint
@@ -117,8 +118,10 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     test = pretraining.views("test") if predicted else workspace.views("test")
     trained = time.monotonic()
     views = test.first(workspace.scale.test_views)
-    batches = semantic_batches(views, workspace.scale.camera, _EVALUATION_BATCH, *place())
-    counts = evaluate(predict, batches, len(test.shards), len(LABELS))
+    passed = SemanticPass(views, workspace.scale.camera, _EVALUATION_BATCH)
+    rank, ranks = place()
+    drawn = batches(passed, range(rank, len(passed), ranks), torch.device(device))
+    counts = evaluate(predict, drawn, len(test.shards), len(LABELS))
     record = Record(
         key=key,
         row=experiment.row,

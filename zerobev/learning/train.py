@@ -14,12 +14,11 @@ import logging
 import pickle
 import time
 import zipfile
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +31,7 @@ from zerobev.config import AUX, TrainConfig
 from zerobev.errors import InputError
 from zerobev.learning.evaluate import model_inputs
 from zerobev.learning.history import Entry, History, columns
+from zerobev.learning.loader import Batch, Source, batches, moved
 from zerobev.learning.losses import Losses, zero_bev_loss
 from zerobev.learning.monitor import curves_figure, write_picture
 from zerobev.learning.precision import computes_bfloat16
@@ -42,22 +42,9 @@ from zerobev.storage import replacing
 CHECKPOINT_SECONDS = 60  #: between two checkpoints, beside those at validations
 HISTORY_ENTRIES = 1000  #: about as many are kept of a run, beside those at validations
 
-Batch = Mapping[str, Tensor]
 Objective = Callable[[nn.Module, Batch], Losses]
 Picture = Callable[[nn.Module, Batch], Figure]
 log = logging.getLogger("zerobev.train")
-
-
-class Source(Protocol):
-    """Training data without an end, addressed by step."""
-
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> Batch:
-        """The share of process `rank` of `ranks` in the batch of `step`.
-
-        The batch holds the samples `step * n ... (step + 1) * n - 1`, n = `TrainConfig.batch`; a process gets every
-        `ranks`-th of them, from `rank` on. Depends on nothing else, may be called from another thread, and does not
-        touch torch's global generator.
-        """
 
 
 def dice_objective(alpha: float, aux: tuple[str, ...] = AUX) -> Objective:
@@ -80,6 +67,7 @@ def train(
     objective: Objective | None = None,
     picture: Picture | None = None,
     device: torch.device | str | None = None,
+    workers: int | None = None,
 ) -> History:
     """Train `model` in place; it is left on the device, in evaluation mode, with the weights that validated best.
 
@@ -95,6 +83,7 @@ def train(
     objective: losses of a batch; by default `dice_objective(config.alpha)`
     picture: draws what the model does with the first validation batch, for `sample.png`
     device: default: a GPU if there is one. Forward passes are bfloat16 where the processor computes in it.
+    workers: processes that draw batches, as `learning.loader.batches` takes them
     """
     accelerator = training_accelerator(device)
     objective = objective or dice_objective(config.alpha)
@@ -103,9 +92,10 @@ def train(
         run = _Run(model, config, folder, key, accelerator)
         try:
             run.resume()
-            with closing(_batches(data, run.step, config.steps, accelerator)) as batches:
-                shown = progress(batches, "training", "step", config.steps, done=run.step)
-                for batch in shown if accelerator.is_main_process else batches:
+            place = accelerator.process_index, accelerator.num_processes
+            with closing(batches(data, range(run.step, config.steps), accelerator.device, place, workers)) as drawn:
+                shown = progress(drawn, "training", "step", config.steps, done=run.step)
+                for batch in shown if accelerator.is_main_process else drawn:
                     torch.manual_seed(_step_seed(seed, run.step, accelerator.process_index))
                     run.advance(objective, batch)
                     if run.step % config.validate_every == 0 or run.step == config.steps:
@@ -167,7 +157,7 @@ class _Run:
         rank, ranks = self.accelerator.process_index, self.accelerator.num_processes
         with torch.no_grad():
             shares = ({name: value[rank::ranks] for name, value in batch.items()} for batch in batches)
-            scores = [objective(self.model, _moved(share, self.accelerator)).main for share in shares]
+            scores = [objective(self.model, moved(share, self.accelerator.device)).main for share in shares]
             score = float(np.mean(self._means(torch.stack(scores)).tolist()))
         self.schedule.validated(score)
         if score < self.best_score:
@@ -186,7 +176,7 @@ class _Run:
             return
         write_picture(curves_figure(columns(self.entries)), self.folder / "curves.png")
         if picture is not None:
-            write_picture(picture(self.bare, _moved(batch, self.accelerator)), self.folder / "sample.png")
+            write_picture(picture(self.bare, moved(batch, self.accelerator.device)), self.folder / "sample.png")
 
     def record(self, score: float | None) -> None:
         """Add an entry to the history, its file and the log."""
@@ -269,29 +259,6 @@ def _read_checkpoint(path: Path, key: str) -> dict[str, Any] | None:
     if found != key:
         raise InputError(f"{path}: expected a checkpoint of the run {key!r}, found one of {found!r}")
     return state
-
-
-def _batches(data: Source, first: int, steps: int, accelerator: Accelerator) -> Generator[Batch, None, None]:
-    """Batches of the steps `first` to `steps - 1`.
-
-    For a GPU each is made in a second thread during the step before it. Not so on a CPU: a thread more than there are
-    cores leaves the others waiting for each other, and made a step ten times slower.
-    """
-    place = accelerator.process_index, accelerator.num_processes
-    if accelerator.device.type == "cpu":
-        yield from (data.batch(step, *place) for step in range(first, steps))
-        return
-    with ThreadPoolExecutor(max_workers=1) as executor:
-        ahead = (executor.submit(data.batch, step, *place) for step in range(first, steps))
-        coming = next(ahead, None)
-        while coming is not None:
-            batch = coming.result()
-            coming = next(ahead, None)
-            yield _moved(batch, accelerator)
-
-
-def _moved(batch: Batch, accelerator: Accelerator) -> Batch:
-    return {name: value.to(accelerator.device, non_blocking=True) for name, value in batch.items()}
 
 
 def _step_seed(seed: int, step: int, rank: int) -> int:
