@@ -5,8 +5,10 @@ import torch
 from torch import nn
 
 from zerobev import benchmark
-from zerobev.benchmark import ROWS, Machine, blocks, flops, measure_inference, training_step
+from zerobev.benchmark import ROWS, measure_inference
 from zerobev.config import SCALES
+from zerobev.learning import benchmark as training
+from zerobev.learning.benchmark import Machine, blocks, flops, least_milliseconds, training_step, waiting_share
 from zerobev.models import build
 
 SMOKE = SCALES["smoke"]
@@ -35,9 +37,50 @@ def test_blocks_are_all_of_a_step():
     assert sum(flops(run) for run in blocks(net, batch, machine).values()) == step > 0
 
 
+def test_a_roofline_in_closed_form():
+    """At 1 GFLOP and 1 MB a millisecond: 1 TFLOP/s and 1 GB/s."""
+    a, b = torch.rand(2, 1000, 250)
+    assert least_milliseconds(lambda: a + b, 1, 1) == pytest.approx(3)  # two read, one written, a megabyte each
+    assert least_milliseconds(lambda: a.add_(b), 1, 1) == pytest.approx(2)  # at least
+    assert least_milliseconds(lambda: a + b[:1], 1, 1) == pytest.approx(2.001)
+    assert least_milliseconds(lambda: a.T.unsqueeze(0).detach().view(1, 250, 1000), 1, 1) == 0
+    assert least_milliseconds(lambda: torch.empty_like(a), 1, 1) == 0
+    product = 2 * 1000 * 250 * 1000 / 1e9  # milliseconds; in memory it takes 2 for the factors, 4 for the result
+    assert least_milliseconds(lambda: a @ b.T, 1, 1) == pytest.approx(6)
+    assert least_milliseconds(lambda: a @ b.T, 0.01, 1) == pytest.approx(100 * product)
+    assert least_milliseconds(lambda: a + a @ b.T @ a, 0.01, 1) == pytest.approx(200 * product + 3)  # one by one
+
+
+def test_a_roofline_of_products_alone_is_their_number():
+    machine = Machine()
+    net = build("c", SMOKE.camera, SMOKE.model).to(machine.device)
+    step = training_step(net, machine.batch(SMOKE.camera, 2), machine)
+    assert least_milliseconds(step, 1, float("inf")) == pytest.approx(flops(step) / 1e9)
+    assert least_milliseconds(step, 1, 1) > least_milliseconds(step, 1, 10) > flops(step) / 1e9
+
+
+def test_waiting_is_the_time_between_steps(monkeypatch):
+    clock = [0.0]
+
+    class Slow:
+        def batch(self, step, rank=0, ranks=1):
+            clock[0] += 3
+            return Machine().batch(SMOKE.camera, 2)
+
+    def counted(net, batch, machine):
+        def step():
+            clock[0] += 5
+
+        return step
+
+    monkeypatch.setattr(training.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(training, "training_step", counted)
+    assert waiting_share(None, Slow(), Machine(), workers=0) == {"share": 3 / 8, "milliseconds": 8000}
+
+
 def test_runs_take_turns_and_the_first_turn_does_not_count(monkeypatch):
     clock, calls = iter(range(100)), []
-    monkeypatch.setattr(benchmark.time, "perf_counter", lambda: next(clock) ** 2)
+    monkeypatch.setattr(training.time, "perf_counter", lambda: next(clock) ** 2)
     found = Machine().milliseconds({name: lambda name=name: calls.append(name) for name in "ab"}, repeats=2)
     assert calls == list("ababab")
     # the clock is read twice to warm up, then from 2^2 to 3^2 for a, from 4^2 to 5^2 for b, and so on

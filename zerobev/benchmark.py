@@ -6,8 +6,7 @@ over are the ratios, to the machine's own peak of matrix products and between se
 
 import argparse
 import itertools
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -17,131 +16,22 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.flop_counter import FlopCounterMode
 
-from zerobev.config import SCALES, CameraConfig, Scale, scale
+from zerobev.config import SCALES, Scale, scale
 from zerobev.errors import run_command
-from zerobev.learning.losses import zero_bev_loss
-from zerobev.learning.precision import computes_bfloat16
-from zerobev.models import BevModel, ZeroBEV, build
+from zerobev.learning.benchmark import Machine, Run, measure_paper_step, measure_training, training_step
+from zerobev.models import BevModel, build
 from zerobev.records import kept, peak_memory_mb
 from zerobev.storage import write_json
 from zerobev.streams import benchmark as generation
-from zerobev.streams.benchmark import spread
 from zerobev.streams.tuples import SynthTuples
 from zerobev.workspace import Workspace
 
 MODALITIES = (1, 8, 40)  #: zero-shot images of one photograph
 ROWS = ("c", "e", "f")  #: that inference is measured of
-_MATMUL = 2048  # side of the matrices whose product is the machine's peak
 _SIZES = (0.5, 1.0, 2.0)  # of images and of maps, times the scale's
 _SCENES = (1, 4)
-_VERSION = 1  # raised by hand when what is measured changes
-
-Run = Callable[[], Any]
-
-
-class Machine:
-    """The device that everything is measured on, and how time is taken there."""
-
-    def __init__(self) -> None:
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.bfloat16 = computes_bfloat16(self.device.type)
-
-    def autocast(self) -> torch.autocast:
-        """As in training."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
-
-    def milliseconds(self, runs: dict[str, Run], repeats: int) -> dict[str, dict[str, float]]:
-        """Spread of the time of each run. They take turns, so that a slow minute is everybody's."""
-        times: dict[str, list[float]] = {name: [] for name in runs}
-        for repeat in range(repeats + 1):  # the first one warms up
-            for name, run in runs.items():
-                start = time.perf_counter()
-                run()
-                if self.device.type == "cuda":
-                    torch.cuda.synchronize()
-                if repeat:
-                    times[name].append(1e3 * (time.perf_counter() - start))
-        return {name: spread(values) for name, values in times.items()}
-
-    def batch(self, camera: CameraConfig, samples: int, images: int = 1) -> dict[str, Tensor]:
-        """Random tensors of the form of `streams.tuples`; what is in them takes no time."""
-        side, cells = camera.fpv_px, camera.bev_px
-        shapes = {"rgb": (3, side), "zero": (images, side), "depth": (1, side), "target": (images, cells)}
-        shapes |= {"aux": (2, cells), "fov": (1, cells)}
-        random = {name: torch.rand(samples, k, n, n, device=self.device) for name, (k, n) in shapes.items()}
-        return {name: image if name in ("rgb", "depth") else image.round() for name, image in random.items()}
-
-
-def training_step(net: BevModel, batch: dict[str, Tensor], machine: Machine) -> Run:
-    """One step as `learning.train` takes it: forward, loss, backward, Adam."""
-    optimizer = torch.optim.Adam(net.parameters(), lr=1e-4, fused=True)
-    net.train()
-
-    def step() -> None:
-        with machine.autocast():
-            projection = net(batch["rgb"], batch["zero"], batch["depth"])
-        zero_bev_loss(projection, batch, 0.5, net.config.aux).total.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-
-    return step
-
-
-def blocks(net: ZeroBEV, batch: dict[str, Tensor], machine: Machine) -> dict[str, Run]:
-    """Forward and backward of each block of the network by itself, on the maps that it gets in a step."""
-    with machine.autocast():
-        rgb = net.backbone(batch["rgb"])
-        fpv = net.fpv_maps(rgb, batch["zero"])
-        pyramid = net.pyramid(fpv)
-        bev, _ = net.bands(pyramid)
-    inputs = {name: _leaves(maps) for name, maps in {"rgb": rgb, "fpv": fpv, "pyramid": pyramid, "bev": [bev]}.items()}
-    parts: dict[str, Callable[[], Iterable[Tensor]]] = {
-        "backbone": lambda: net.backbone(batch["rgb"]),
-        "zero-shot CNN": lambda: net.fpv_maps(inputs["rgb"], batch["zero"]),
-        "pyramid": lambda: net.pyramid(inputs["fpv"]),
-        "band transformers": lambda: [net.bands(inputs["pyramid"])[0]],
-        "U-Net": lambda: [net.decoder(inputs["bev"][0])],
-    }
-
-    def both(part: Callable[[], Iterable[Tensor]]) -> Run:
-        def run() -> None:
-            with machine.autocast():
-                outputs = list(part())
-            torch.autograd.backward(outputs, [torch.ones_like(output) for output in outputs])
-
-        return run
-
-    return {name: both(part) for name, part in parts.items()}
-
-
-def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
-    """A step of (c), its blocks, and the drawing of its batch; and what share of the peak of products they reach.
-
-    The peak is that of the matrix product of two matrices of 2048 x 2048, in bfloat16 where training computes in it.
-    """
-    net = build("c", setting.camera, setting.model).to(machine.device)
-    assert isinstance(net, ZeroBEV)  # as row (c) is
-    batch = machine.batch(setting.camera, setting.train.batch)
-    matrix = torch.rand(_MATMUL, _MATMUL, device=machine.device)
-    matrix = matrix.bfloat16() if machine.bfloat16 else matrix
-    views = Workspace(setting.name).views("train", _SCENES[0])
-    samples = (setting.camera, 0, setting.train.batch, setting.blank)
-    stream = SynthTuples(views, Workspace(setting.name).bank(), *samples, upright=setting.upright)
-    runs: dict[str, Run] = {"matrix product": lambda: matrix @ matrix, "step": training_step(net, batch, machine)}
-    runs |= blocks(net, batch, machine) | {"batch": lambda: stream.batch(0)}
-    milliseconds = machine.milliseconds(runs, repeats)
-    peak = 2 * _MATMUL**3 / milliseconds["matrix product"]["low"] / 1e9  # TFLOP a second
-    operations = {name: flops(run) for name, run in runs.items() if name != "batch"}
-    step, drawn = milliseconds["step"]["median"], milliseconds["batch"]["median"]
-    return {
-        "milliseconds": milliseconds,
-        "gigaflops": {name: count / 1e9 for name, count in operations.items()},
-        "peak_tflops": peak,
-        "share_of_peak": {n: count / milliseconds[n]["median"] / 1e9 / peak for n, count in operations.items()},
-        "data_share": drawn / (step + drawn),
-    }
+_VERSION = 2  # raised by hand when what is measured changes
 
 
 def measure_inference(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
@@ -228,17 +118,11 @@ def _next_batch(stream: SynthTuples, steps: Iterator[int]) -> None:
     stream.batch(next(steps))
 
 
-def flops(run: Run) -> int:
-    """Floating-point operations of matrix products and convolutions, forward and backward."""
-    with FlopCounterMode(display=False) as counter:
-        run()
-    return counter.get_total_flops()
-
-
 def measure(setting: Scale, repeats: int) -> dict[str, Any]:
     """Everything, as plain data."""
     machine = Machine()
     training = measure_training(setting, machine, repeats)
+    paper = measure_paper_step(machine, max(repeats // 3, 1))
     inference = measure_inference(setting, machine, repeats)
     return {
         "scale": setting.name,
@@ -248,6 +132,7 @@ def measure(setting: Scale, repeats: int) -> dict[str, Any]:
         "k8_over_k1": inference["c"]["k8_over_k1"],
         "generation": generation.measure(setting, repeats, seconds=1.0),
         "training": training,
+        "paper_step": paper,
         "inference": inference,
         "sizes": measure_sizes(setting, machine, repeats),
         "memory_mb": measure_memory(setting),
@@ -259,20 +144,20 @@ def table(measured: dict[str, Any]) -> list[str]:
     training = measured["training"]
     lines = [f"scale {measured['scale']} on {measured['device']}: median [smallest, largest] of the repeats, ms"]
     lines += [f"generation, {line}" for line in generation.table(measured["generation"])[1:]]
-    for name, ms in training["milliseconds"].items():
-        share = training["share_of_peak"].get(name)
-        of_peak = "" if share is None else f"{100 * share:6.1f} % of the peak"
-        lines.append(f"training, {name:<24}{ms['median']:>9.1f}  [{ms['low']:.1f}, {ms['high']:.1f}]{of_peak}")
+    for what, found in ("training", training), ("paper's sizes", measured["paper_step"]):
+        for name, ms in found["milliseconds"].items():
+            lines.append(f"{f'{what}, {name}':<34}{ms['median']:>9.1f}  [{ms['low']:.1f}, {ms['high']:.1f}]")
+            if name in found["share_of_peak"]:
+                of = [100 * found[share][name] for share in ("share_of_peak", "share_of_roofline")]
+                lines[-1] += f"  {of[0]:5.1f} % of the peak, {of[1]:5.1f} % of the roofline"
     lines.append(f"{'data, share of a step':<34}{100 * training['data_share']:>9.1f} %")
+    for workers, waiting in training["waiting_share"].items():
+        lines.append(f"{f'waiting for data, workers: {workers}':<34}{100 * waiting['share']:>9.1f} %")
     for row, found in measured["inference"].items():
         shares = ", ".join(f"{k}: {ratio:.2f}" for k, ratio in found["shared_over_separate"].items())
         lines.append(f"inference ({row}): 8 images take {found['k8_over_k1']:.2f} x one; one call / K calls {shares}")
     lines += [f"{name:<34}{one['ratio']:>9.2f} x" for name, one in measured["sizes"].items()]
     return lines + [f"memory, {name:<26}{peak:>9.0f} MB" for name, peak in measured["memory_mb"].items()]
-
-
-def _leaves(maps: Iterable[Tensor]) -> list[Tensor]:
-    return [m.detach().clone().requires_grad_() for m in maps]
 
 
 def recorded_benchmark(workspace: Workspace) -> dict[str, Any]:
