@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,3 +142,23 @@ def test_what_is_kept_is_computed_once_for_each_identity(tmp_path):
     path.write_text("{}")
     with pytest.raises(InputError, match=r"a\.json: expected a record, found KeyError"):
         kept(path, {"weights": "y"}, compute)
+
+
+def test_a_revision_is_dirty_where_the_code_was_changed(tmp_path):
+    def git(*arguments: str) -> None:
+        settings = ("-c", "user.name=a", "-c", "user.email=a@b")
+        subprocess.run(["git", *settings, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    code, report = tmp_path / "code", tmp_path / "report.json"
+    code.mkdir()
+    (code / "a.py").write_text("a = 1\n")
+    assert git_revision(code) == "unknown"
+    git("init")
+    git("add", ".")
+    git("commit", "-m", "a")
+    clean = git_revision(code)
+    assert re.fullmatch("[0-9a-f]{12}", clean)
+    report.write_text("{}")  # what a reproduction writes
+    assert git_revision(code) == clean
+    (code / "a.py").write_text("a = 2\n")
+    assert git_revision(code) == f"{clean}-dirty"

@@ -166,16 +166,15 @@ def is_fresh(path: Path) -> bool:
     return path.stat().st_mtime >= float(os.environ.get("ZEROBEV_FRESH", 0))
 
 
-def git_revision() -> str:
-    """The commit of the code, with "-dirty" where it was changed since; "unknown" outside a checkout."""
-    found = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return found.stdout.strip() or "unknown"
+def git_revision(code: Path = Path(__file__).parent) -> str:
+    """The commit that `code` is checked out at, with "-dirty" where it differs; "unknown" outside a checkout.
+
+    Reports and notebooks may differ: a reproduction writes them.
+    """
+    commands = ["describe", "--always", "--abbrev=12"], ["status", "--porcelain", "."]
+    found = [subprocess.run(["git", *c], cwd=code, capture_output=True, text=True, check=False) for c in commands]
+    revision, changes = (ended.stdout.strip() for ended in found)
+    return (revision + "-dirty" if changes else revision) or "unknown"
 
 
 def origin(device: str, revision: str) -> dict[str, Any]:
