@@ -124,6 +124,20 @@ MUTATIONS = (
         "[np.roll(image, i == 0, 0).reshape(-1, 3) for i, image in enumerate(texels)]",
         ("tests/test_tuples.py",),
     ),
+    Mutation(
+        "what is raised painted by the camera's place alone",
+        "zerobev/streams/tuples.py",
+        "(x * right + y * forward + view.pose[axis])",
+        "(x * (axis == 0) + y * (axis == 1) + view.pose[axis])",
+        ("tests/test_tuples.py",),
+    ),
+    Mutation(
+        "a batch where a share of it was asked for",
+        "zerobev/learning/loader.py",
+        "self._source.batch(step, *self._place)",
+        "self._source.batch(step)",
+        ("tests/test_loader.py",),
+    ),
     # splits
     Mutation(
         "trained on the test homes",
