@@ -128,6 +128,13 @@ def test_decoder_gives_every_size_back(size):
     assert BevDecoder(16, (8, 8, 8), 3)(torch.rand(2, 16, size, size)).shape == (2, 3, size, size)
 
 
+def test_maps_of_one_image_stay_channels_last():
+    """Turned around they are copied in every convolution that follows."""
+    net = build("c", SMOKE.camera, SMOKE.model)
+    maps = net.fpv_maps(net.backbone(torch.rand(2, 3, 32, 32)), torch.rand(2, 1, 32, 32))
+    assert all(m.is_contiguous(memory_format=torch.channels_last) for m in (*maps, *net.pyramid(maps)))
+
+
 def test_map_features_are_zero_where_no_column_looks():
     net = network()
     features, _ = net.bands(net.pyramid(net.fpv_maps(net.backbone(torch.rand(2, 3, 32, 32)), torch.rand(2, 1, 32, 32))))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skimage.morphology import convex_hull_image
 
 from zerobev.config import CameraConfig
-from zerobev.streams.projection import cells_of_pixels, fov_mask, map_points, project
+from zerobev.streams.projection import cells_of_pixels, fov_mask, map_points, project, project_mask
 
 CAMERA = CameraConfig(fpv_px=24, bev_px=20)
 NOWHERE = CAMERA.bev_px**2
@@ -119,6 +119,16 @@ def test_voxels_of_five_centimetres_make_no_difference_where_cells_are_whole_vox
             cell = pooled[..., int(cell_of_voxel[row]), int(cell_of_voxel[column])]
             np.maximum(cell, fine[..., row, column], out=cell)
     assert (pooled <= direct).all()  # what lies in whole voxels is there
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_the_projection_of_one_mask_is_that_of_an_image(seed):
+    zero, depth = random_view(seed, CAMERA)
+    mask = zero[0, 0] > 0
+    expected = project(mask[None, None].double(), depth[:1], CAMERA)[0, 0].numpy()
+    found = project_mask(mask.numpy(), depth[0, 0].numpy(), CAMERA)
+    assert found.dtype == bool and np.array_equal(found, expected > 0)
 
 
 @given(SEEDS)

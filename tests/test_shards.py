@@ -114,6 +114,15 @@ def test_a_shard_travels_to_another_process_while_open(scene, views, tmp_path):
     assert np.array_equal(pickle.loads(pickle.dumps(shard)).view(0).rgb, first.rgb)
 
 
+def test_what_was_read_is_not_kept(scene, views, tmp_path):
+    """HDF5 would keep some megabytes of chunks of every shard that is open: in the end, all views."""
+    write_shard(tmp_path / "a.h5", scene, views, CAMERA, TEXTURE, SEED)
+    shard = Shard(tmp_path / "a.h5", CAMERA, TEXTURE)
+    shard.view(0)
+    _, cached_bytes, _ = shard._views.id.get_access_plist().get_chunk_cache()
+    assert cached_bytes == 0
+
+
 def test_same_seed_same_bytes_at_any_time(scene, views, tmp_path):
     write_shard(tmp_path / "a.h5", scene, views, CAMERA, TEXTURE, SEED)
     other = views_of(scene, seed=1)

@@ -210,6 +210,8 @@ def test_look_up_is_its_definition(bank, seed, scale):
     assert values.shape == (9, 31) and values.dtype == bool
     assert values.tolist() == [[naive(bank, draw, *map(int, texel)) for texel in row] for row in texels]
     assert not values[texels[..., 0] == -1].any()
+    with pytest.raises(IndexError):  # a chart that the draw does not dress
+        bank.look_up(np.full((2, 2, 3), 5, np.int16), draw)
 
 
 def test_fpv_and_bev_see_one_texture(bank):

@@ -155,7 +155,7 @@ def _storage(tensor: Tensor) -> int:
 def least_milliseconds(run: Run, peak_tflops: float, bandwidth_gbs: float) -> float:
     """The roofline of `run`: what its operations take if each is held up by products or by memory alone.
 
-    Bytes that an operation finds in a cache are counted as well, so that small ones can be faster.
+    Bytes that an operation finds in a cache are counted as if it did not: small operations can be faster.
     """
     with _Operations() as below:
         run()
@@ -174,10 +174,8 @@ def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str
     numbers = itertools.count()
     drawing = {"batch": lambda: stream.batch(next(numbers))}
     measured = _against_the_machine({"step": step} | blocks(net, batch, machine), drawing, machine, repeats)
-    milliseconds = measured["milliseconds"]
-    drawn, taken = milliseconds["batch"]["median"], milliseconds["step"]["median"]
     waiting = {str(workers): waiting_share(net, stream, machine, workers) for workers in (0, 1)}
-    return measured | {"data_share": drawn / (taken + drawn), "waiting_share": waiting}
+    return measured | {"waiting_share": waiting}
 
 
 def measure_paper_step(machine: Machine, repeats: int) -> dict[str, Any]:

@@ -20,7 +20,10 @@ def _slopes(camera: CameraConfig) -> np.ndarray:
 
 
 def map_coordinates(depth: torch.Tensor, camera: CameraConfig) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The coordinates of `map_points`, an array (..., H, W) each: x to the right, y forward, z above the floor."""
+    """The coordinates of `map_points`, a tensor (..., H, W) each: x to the right, y forward, z above the floor, metres.
+
+    depth: (..., H, W) planar depth, metres, of square images
+    """
     slopes = torch.as_tensor(_slopes(camera), dtype=depth.dtype, device=depth.device)
     return slopes * depth, depth, camera.height_m - slopes[:, None] * depth
 

@@ -294,12 +294,12 @@ class TextureBank:
 
         chart, *places = np.ascontiguousarray(np.moveaxis(texels, -1, 0))
         chart = chart.astype(np.intp)
-        index = first.take(chart, mode="wrap")  # this mode alone does not copy
+        index = first[chart]
         for axis, place in enumerate(places):
             if draw.scale != 1:
                 place = place * draw.scale
             place = place.astype(np.int32)
-            place += draw.offset[:, axis].take(chart, mode="wrap")
+            place += draw.offset[:, axis][chart]
             place -= place // side * side  # numpy's % is slower
-            index += place * stride[:, axis].take(chart, mode="wrap")
-        return self.tiles.reshape(-1).take(index, mode="wrap") & (chart >= 0)
+            index += place * stride[:, axis][chart]
+        return self.tiles.reshape(-1)[index] & (chart >= 0)
