@@ -10,11 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from zerobev.benchmark import recorded_benchmark
 from zerobev.beyond import OWN_CLAIMS
 from zerobev.claims import compare, judge
 from zerobev.config import SCALES
 from zerobev.experiments import EXPERIMENTS
 from zerobev.learning.metrics import Counts
+from zerobev.learning.motion import recorded_motion
+from zerobev.learning.unseen import recorded_unseen
 from zerobev.paper import CLAIMS, RATIOS, TABLES
 from zerobev.records import Record, RecordStore
 from zerobev.report import table
@@ -52,6 +55,24 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
     assert store.is_sealed("c-0")
     np.savez(tmp_path / "gallery/c-0.npz", maps=np.packbits(maps, axis=-1), cells=5)  # as before there were seals
     assert np.array_equal(store.maps("c-0"), maps) and not store.is_sealed("c-0")
+
+
+@pytest.mark.parametrize(
+    ("read", "starts_with"),
+    [
+        (recorded_benchmark, "zerobev.benchmark.measure"),
+        (recorded_motion, "zerobev.learning.motion.ensure_homes"),
+        (recorded_unseen, "zerobev.learning.unseen.ensure_homes"),
+    ],
+)
+def test_what_is_measured_once_was_measured_by_this_code(monkeypatch, read, starts_with: str):
+    """Else a notebook measures it anew, and shows other figures than those it was committed with."""
+
+    def unexpected(*_, **__) -> None:
+        raise AssertionError("found no record of this code and these weights, expected a committed one")
+
+    monkeypatch.setattr(starts_with, unexpected)
+    assert len(read(Workspace("reduced")))
 
 
 def test_the_page_of_results_says_what_the_records_say():

@@ -144,6 +144,7 @@ def _arrays(path: Path, expected: str) -> dict[str, np.ndarray]:
 def kept(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """What `compute` makes of `identity`: read from `path` where it is recorded there, else computed and recorded.
 
+    The result is what JSON makes of it, keys in order, the first time, too: what is shown of it stays the same.
     identity: all that the result depends on, plain data; a record of another identity is replaced
     Raises `InputError` for a file that is no such record.
     """
@@ -158,7 +159,7 @@ def kept(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, A
     result = compute()
     made = {"origin": origin("cpu", revision), "seconds": round(time.monotonic() - started, 1)}
     write_json(path, {"identity": identity, **made, "result": result})
-    return result
+    return json.loads(path.read_text())["result"]
 
 
 def is_fresh(path: Path) -> bool:
