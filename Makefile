@@ -20,8 +20,6 @@ READY := .venv/.ready
 RENDERER := .venv/.renderer
 MESA := libegl1 libgl1 libgl1-mesa-dri
 
-# Photographs are rendered without a display; a user's own choice of platform stands.
-export PYOPENGL_PLATFORM ?= egl
 export TOKENIZERS_PARALLELISM ?= false
 # Packages come from .venv alone.
 unexport PYTHONHOME PYTHONPATH

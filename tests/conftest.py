@@ -4,7 +4,6 @@ import os
 
 import hypothesis
 
-os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 os.environ.setdefault("MPLBACKEND", "agg")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 

@@ -62,7 +62,6 @@ def kernel_settings() -> dict[str, str]:
         "JUPYTER_PATH": str(Path(sys.prefix) / "share" / "jupyter"),
         "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
-        "PYOPENGL_PLATFORM": os.environ.get("PYOPENGL_PLATFORM", "egl"),
         # a progress bar of Jupyter widgets is not wanted, so that it cannot be had is no news
         "PYTHONWARNINGS": "ignore:IProgress not found",
         "TOKENIZERS_PARALLELISM": os.environ.get("TOKENIZERS_PARALLELISM", "false"),

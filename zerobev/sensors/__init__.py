@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 
-# pyrender chooses its platform on import: without this it looks for a window
+# pyrender chooses its platform on import: without this it looks for a window; a user's own choice stands
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 # it imports pyglet, for a viewer that is not used here, and pyglet fails where only a part of X11 is installed
 os.environ.setdefault("PYGLET_HEADLESS", "true")
