@@ -24,7 +24,7 @@ export TOKENIZERS_PARALLELISM ?= false
 # Packages come from .venv alone.
 unexport PYTHONHOME PYTHONPATH
 
-.PHONY: help setup reproduce test coverage lab notebooks clean distclean
+.PHONY: help setup reproduce test pytest nbval coverage lab notebooks clean distclean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -45,10 +45,17 @@ reproduce: setup ## run the workbook [SCALE=smoke|reduced|paper SCENES=dir TEXTU
 	[ -n "$$fresh" ] || $(PYTHON) -m zerobev.spot_check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${SPOT:+--row "$$SPOT"}
 
-test: setup ## run the tests, then check every notebook against its committed outputs
+# Both at once: most of either computes on one core. What the notebooks say is printed whole, when they are through.
+test: setup ## run the tests, and check every notebook against its committed outputs
+	@$(MAKE) --jobs=2 --keep-going pytest nbval
+
+pytest: setup ## run the tests alone
+	@$(PYTHON) -m pytest tests
+
+nbval: setup ## check the notebooks alone
 	@status=0
-	$(PYTHON) -m pytest tests || status=$$?
-	$(PYTHON) -m pytest --nbval notebooks || status=$$?
+	report="$$($(PYTHON) -m pytest --nbval notebooks 2>&1)" || status=$$?
+	printf '\n%s\n' "$$report"
 	exit $$status
 
 coverage: setup ## run the tests and say which lines of zerobev/ they reach
