@@ -176,6 +176,21 @@ MUTATIONS = (
         "return self.aux(features, values)\n",
         ("tests/test_theory.py::test_cross_attention_is_the_scaled_dot_product",),
     ),
+    # speed and memory
+    Mutation(
+        "views kept in memory",
+        "zerobev/streams/shards.py",
+        "h5py.File(self.path, rdcc_nbytes=0)",
+        "h5py.File(self.path)",
+        ("tests/test_shards.py::test_what_was_read_is_not_kept",),
+    ),
+    Mutation(
+        "a benchmark of earlier code",
+        "zerobev/benchmark.py",
+        re.compile(r"_VERSION = \d+"),
+        lambda match: f"{match[0]}0",
+        ("tests/test_trust.py::test_what_is_measured_once_was_measured_by_this_code",),
+    ),
 )
 
 

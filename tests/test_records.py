@@ -132,7 +132,7 @@ def test_origin_says_where_a_number_comes_from():
 def test_what_is_kept_is_computed_once_for_each_identity(tmp_path):
     path, made = tmp_path / "a.json", []
 
-    def compute() -> dict[str, int]:
+    def compute() -> dict[str, object]:
         made.append(len(made))
         return {"value": made[-1], "spread": (0.5, 1.5)}
 

@@ -145,6 +145,7 @@ def kept(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, A
     """What `compute` makes of `identity`: read from `path` where it is recorded there, else computed and recorded.
 
     The result is what JSON makes of it, keys in order, the first time, too: what is shown of it stays the same.
+
     identity: all that the result depends on, plain data; a record of another identity is replaced
     Raises `InputError` for a file that is no such record.
     """
