@@ -8,7 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from zerobev.reproduce import kernel_settings
+from zerobev.report.notebooks import kernel_settings
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from zerobev.errors import InputError, run_command
+from zerobev.common.errors import InputError, run_command
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -68,14 +68,14 @@ MUTATIONS = (
     ),
     Mutation(
         "two published rows of Table 1 swapped",
-        "zerobev/paper.py",
+        "zerobev/report/paper.py",
         re.compile(r'(\("b\.1", "VPN[^"]*", )("[^"]*")(\),\s*\("b\.2", "TIM[^"]*", )("[^"]*")'),
         r"\1\4\3\2",
         ("tests/test_claims.py::test_every_claim_names_rows_of_its_table_and_holds_in_the_paper",),
     ),
     Mutation(
         "two published rows of Table 4 swapped",
-        "zerobev/paper.py",
+        "zerobev/report/paper.py",
         re.compile(r'(\("c\.10", "[^"]*", )("[^"]*")(\),\s*\("c\.15", "[^"]*", )("[^"]*")'),
         r"\1\4\3\2",
         ("tests/test_trust.py::test_published_numbers_are_those_that_were_checked",),
@@ -83,28 +83,28 @@ MUTATIONS = (
     # axes of the map
     Mutation(
         "cells far and near exchanged",
-        "zerobev/sensors/cameras.py",
+        "zerobev/geometry/cameras.py",
         "across[::-1])",
         "across)",
         ("tests/test_cameras.py",),
     ),
     Mutation(
         "cells left and right exchanged",
-        "zerobev/sensors/cameras.py",
+        "zerobev/geometry/cameras.py",
         "np.meshgrid(across - camera.bev_extent_m / 2,",
         "np.meshgrid(camera.bev_extent_m / 2 - across,",
         ("tests/test_cameras.py",),
     ),
     Mutation(
         "projection far and near exchanged",
-        "zerobev/streams/projection.py",
+        "zerobev/geometry/projection.py",
         "row = side - 1 - torch.floor(y / camera.cell_m).long()",
         "row = torch.floor(y / camera.cell_m).long()",
         ("tests/test_projection.py",),
     ),
     Mutation(
         "projection left and right exchanged",
-        "zerobev/streams/projection.py",
+        "zerobev/geometry/projection.py",
         "torch.floor((x + camera.bev_extent_m / 2)",
         "torch.floor((camera.bev_extent_m / 2 - x)",
         ("tests/test_projection.py",),
@@ -112,28 +112,28 @@ MUTATIONS = (
     # the zero-shot stream
     Mutation(
         "zero-shot image a pixel to the right",
-        "zerobev/streams/tuples.py",
+        "zerobev/data/samples.py",
         '"zero": zero.astype(np.float32)',
         '"zero": np.roll(zero, 1, axis=-1).astype(np.float32)',
         ("tests/test_tuples.py",),
     ),
     Mutation(
         "textures a pixel down",
-        "zerobev/streams/tuples.py",
+        "zerobev/data/samples.py",
         "[image.reshape(-1, 3) for image in texels]",
         "[np.roll(image, i == 0, 0).reshape(-1, 3) for i, image in enumerate(texels)]",
         ("tests/test_tuples.py",),
     ),
     Mutation(
         "what is raised painted by the camera's place alone",
-        "zerobev/streams/tuples.py",
+        "zerobev/data/samples.py",
         "(x * right + y * forward + view.pose[axis])",
         "(x * (axis == 0) + y * (axis == 1) + view.pose[axis])",
         ("tests/test_tuples.py",),
     ),
     Mutation(
         "a batch where a share of it was asked for",
-        "zerobev/learning/loader.py",
+        "zerobev/training/loader.py",
         "self._source.batch(step, *self._place)",
         "self._source.batch(step)",
         ("tests/test_loader.py",),
@@ -141,14 +141,14 @@ MUTATIONS = (
     # splits
     Mutation(
         "trained on the test homes",
-        "zerobev/runs.py",
+        "zerobev/experiments/runs.py",
         'stream(experiment, workspace, "train", depth, seed)',
         'stream(experiment, workspace, "test", depth, seed)',
         (f"{_RUNS}test_training_never_opens_a_test_scene",),
     ),
     Mutation(
         "validated on the test homes",
-        "zerobev/runs.py",
+        "zerobev/experiments/runs.py",
         'stream(experiment, workspace, "validation",',
         'stream(experiment, workspace, "test",',
         (f"{_RUNS}test_training_never_opens_a_test_scene",),
@@ -156,14 +156,14 @@ MUTATIONS = (
     # depth of (a.2)
     Mutation(
         "true depth for (a.2), as configured",
-        "zerobev/experiments.py",
+        "zerobev/experiments/registry.py",
         'Experiment("a.2", None)',
         'Experiment("a.2", None, test_depth="gt")',
         (f"{_RUNS}test_every_row_of_every_table_is_a_run_and_each_run_is_one_row",),
     ),
     Mutation(
         "true depth for (a.2), as computed",
-        "zerobev/runs.py",
+        "zerobev/experiments/runs.py",
         'test = pretraining.views("test") if predicted else workspace.views("test")',
         'test = workspace.views("test")',
         (f"{_RUNS}test_projections_are_what_their_depth_says",),
@@ -179,14 +179,14 @@ MUTATIONS = (
     # speed and memory
     Mutation(
         "views kept in memory",
-        "zerobev/streams/shards.py",
+        "zerobev/data/shards.py",
         "h5py.File(self.path, rdcc_nbytes=0)",
         "h5py.File(self.path)",
         ("tests/test_shards.py::test_what_was_read_is_not_kept",),
     ),
     Mutation(
         "a benchmark of earlier code",
-        "zerobev/benchmark.py",
+        "zerobev/benchmarks/run.py",
         re.compile(r"_VERSION = \d+"),
         lambda match: f"{match[0]}0",
         ("tests/test_trust.py::test_what_is_measured_once_was_measured_by_this_code",),

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from zerobev.learning.metrics import Counts
-from zerobev.records import Record
+from zerobev.evaluation.metrics import Counts
+from zerobev.experiments.records import Record
 
 
 def record(row: str, percent: list[list[float]], seed: int = 0, cells: int = 1000) -> Record:

@@ -5,10 +5,10 @@ import torch
 from torch import nn
 
 from zerobev import benchmark
-from zerobev.benchmark import ROWS, measure_inference
+from zerobev.benchmarks.run import ROWS, measure_inference
 from zerobev.config import SCALES
 from zerobev.learning import benchmark as training
-from zerobev.learning.benchmark import Machine, blocks, flops, least_milliseconds, training_step, waiting_share
+from zerobev.benchmarks.training import Machine, blocks, flops, least_milliseconds, training_step, waiting_share
 from zerobev.models import build
 
 SMOKE = SCALES["smoke"]

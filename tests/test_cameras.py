@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zerobev.config import CameraConfig
-from zerobev.sensors.cameras import Pose, bev_cell_centres, fpv_rays
+from zerobev.geometry.cameras import Pose, bev_cell_centres, fpv_rays
 
 YAWS = st.floats(-10, 10)
 CAMERAS = st.builds(CameraConfig, fpv_px=st.integers(1, 33), bev_px=st.integers(1, 33), hfov_deg=st.floats(20, 150))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from records_for_tests import record
 
-from zerobev.claims import compare, judge
+from zerobev.report.claims import compare, judge
 from zerobev.config import LABELS
-from zerobev.errors import InputError
-from zerobev.paper import CLAIMS, RATIOS, TABLES, Ordering, Ratio, Similar
+from zerobev.common.errors import InputError
+from zerobev.report.paper import CLAIMS, RATIOS, TABLES, Ordering, Ratio, Similar
 
 CLAIM = Ordering("1.5", "class", "better", "d", "c")
 

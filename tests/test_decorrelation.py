@@ -9,8 +9,8 @@ from hypothesis.extra import numpy as hnp
 from scipy import ndimage, stats
 
 from zerobev.config import CameraConfig
-from zerobev.errors import InputError
-from zerobev.streams.decorrelation import (
+from zerobev.common.errors import InputError
+from zerobev.evaluation.decorrelation import (
     Measure,
     class_of_cells,
     colour_of_cells,
@@ -20,7 +20,7 @@ from zerobev.streams.decorrelation import (
     prediction_auc,
     shape_of_cells,
 )
-from zerobev.streams.projection import cells_of_pixels
+from zerobev.geometry.projection import cells_of_pixels
 
 SIDE = 12
 

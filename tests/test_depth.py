@@ -18,13 +18,13 @@ from transformers import (
 )
 
 from zerobev.config import SCALES, TrainConfig
-from zerobev.errors import InputError
-from zerobev.learning.depth import DepthErrors, DepthTuples, depth_errors, depth_objective, predict_depth, train_depth
+from zerobev.common.errors import InputError
+from zerobev.training.depth import DepthErrors, DepthTuples, depth_errors, depth_objective, predict_depth, train_depth
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
 from zerobev.models.depth import FARTHEST_M, DepthNet, HubDepth
-from zerobev.models.weights import load_backbone
-from zerobev.streams.tuples import ViewSet
-from zerobev.streams.views import View
+from zerobev.models.backbone_weights import load_backbone
+from zerobev.data.samples import ViewSet
+from zerobev.data.views import View
 
 SMOKE = SCALES["smoke"]
 

@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from zerobev.config import SCALES
-from zerobev.diagram import Stage, draw_networks, stages
+from zerobev.report.diagram import Stage, draw_networks, stages
 from zerobev.models.variants import VARIANTS, build
 
 SMOKE = SCALES["smoke"]

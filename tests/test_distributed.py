@@ -26,22 +26,22 @@ from torch import nn
 
 from zerobev import runs
 from zerobev.config import LABELS, SCALES, CameraConfig, SceneConfig, TextureConfig, TrainConfig
-from zerobev.experiments import EXPERIMENTS
-from zerobev.learning.evaluate import evaluate, model_inputs, model_predictor, place
-from zerobev.learning.history import History
-from zerobev.learning.losses import Losses, zero_bev_loss
-from zerobev.learning.train import train
+from zerobev.experiments.registry import EXPERIMENTS
+from zerobev.evaluation.evaluate import evaluate, model_inputs, model_predictor, place
+from zerobev.training.history import History
+from zerobev.training.losses import Losses, zero_bev_loss
+from zerobev.training.train import train
 from zerobev.models import ZeroBEV
 from zerobev.models import build as build_network
-from zerobev.models.checkpoint import BevModel
-from zerobev.parallel import cluster
-from zerobev.pretraining import DepthPretraining
-from zerobev.records import RecordStore
-from zerobev.runs import run_key
+from zerobev.models.base import BevModel
+from zerobev.common.parallel import cluster
+from zerobev.experiments.depth_pretraining import DepthPretraining
+from zerobev.experiments.records import RecordStore
+from zerobev.experiments.runs import run_key
 from zerobev.scenes.hm3dsem_writer import write_scene
-from zerobev.streams.generate import generate
-from zerobev.streams.tuples import semantic_batches
-from zerobev.workspace import Workspace
+from zerobev.data.generate import generate
+from zerobev.data.samples import semantic_batches
+from zerobev.experiments.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parents[1]
 SMOKE = SCALES["smoke"]

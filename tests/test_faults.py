@@ -19,22 +19,22 @@ from scenes_for_tests import box, build, furnished, room
 from torch import Tensor, nn
 
 from zerobev.config import SCALES, AgentConfig, CameraConfig, TextureConfig, TrainConfig
-from zerobev.errors import InputError
-from zerobev.learning.losses import Losses
-from zerobev.learning.metrics import Counts
-from zerobev.learning.train import train
+from zerobev.common.errors import InputError
+from zerobev.training.losses import Losses
+from zerobev.evaluation.metrics import Counts
+from zerobev.training.train import train
 from zerobev.models import build as build_network
-from zerobev.records import Record, RecordStore
-from zerobev.reproduce import only_run
+from zerobev.experiments.records import Record, RecordStore
+from zerobev.report.notebooks import only_run
 from zerobev.scenes.hm3dsem import read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 from zerobev.scenes.scene import Scene
-from zerobev.sensors.poses import navigable_floor
-from zerobev.storage import write_json
-from zerobev.streams.generate import generate, verify
-from zerobev.streams.shards import write_shard
-from zerobev.streams.textures import TextureBank
-from zerobev.streams.views import View, ViewSource
+from zerobev.rendering.poses import navigable_floor
+from zerobev.common.storage import write_json
+from zerobev.data.generate import generate, verify
+from zerobev.data.shards import write_shard
+from zerobev.data.textures import TextureBank
+from zerobev.data.views import View, ViewSource
 
 CAMERA, TEXTURE = CameraConfig(fpv_px=16, bev_px=10), TextureConfig(tiles=2)
 NOISE = np.random.default_rng(0).random((2, 128, 128))

@@ -20,13 +20,13 @@ from dask.distributed import LocalCluster
 from scenes_for_tests import build, furnished, room
 
 from zerobev.config import CameraConfig, TextureConfig, scale
-from zerobev.errors import InputError, run_command
+from zerobev.common.errors import InputError, run_command
 from zerobev.scenes.hm3dsem import read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 from zerobev.streams import generate as generation
-from zerobev.streams.generate import generate, shard_path, verify
-from zerobev.streams.shards import Shard, checksum
-from zerobev.streams.views import ViewSource
+from zerobev.data.generate import generate, shard_path, verify
+from zerobev.data.shards import Shard, checksum
+from zerobev.data.views import ViewSource
 
 CAMERA = CameraConfig(fpv_px=16, bev_px=10)
 TEXTURE = TextureConfig()
@@ -267,7 +267,7 @@ def test_killed_run_goes_on_and_redoes_nothing(homes, tmp_path, monkeypatch):
     unbroken, out, log = tmp_path / "unbroken", tmp_path / "out", tmp_path / "log"
     options = ["--scenes", str(homes), "--scale", "smoke", "--views", "25", "--out"]
     call(monkeypatch, *options, unbroken)
-    again = [sys.executable, "-m", "zerobev.streams.generate", *options, str(out), "--workers", "2"]
+    again = [sys.executable, "-m", "zerobev.data.generate", *options, str(out), "--workers", "2"]
     killed = subprocess.Popen(again, cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
     while len(there := list(out.glob("train/[!.]*.h5"))) < 2:
         assert killed.poll() is None

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from zerobev.config import LABELS, NO_LABEL
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.scenes.glb import placed_meshes, read_glb
 from zerobev.scenes.hm3dsem import FIRST_LINE, read_instances, read_scene, split_scenes
 from zerobev.scenes.hm3dsem_writer import srgb_to_linear, write_dataset_config, write_scene
@@ -564,9 +564,9 @@ from pathlib import Path
 import numpy as np
 from zerobev.config import CameraConfig
 from zerobev.scenes.hm3dsem import read_scene
-from zerobev.sensors.cameras import Pose
-from zerobev.sensors.gbuffer import RayCaster
-from zerobev.sensors.photograph import Photographer
+from zerobev.geometry.cameras import Pose
+from zerobev.rendering.gbuffer import RayCaster
+from zerobev.rendering.photograph import Photographer
 
 camera, pose = CameraConfig(fpv_px=64, bev_px=40), Pose(*map(float, sys.argv[3:]))
 scene = read_scene(Path(sys.argv[1]))

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor, distributed, multiprocessing
 
-from zerobev.errors import InputError
-from zerobev.learning.losses import dice_loss, zero_bev_loss
+from zerobev.common.errors import InputError
+from zerobev.training.losses import dice_loss, zero_bev_loss
 
 UNIT = st.floats(0, 1, width=32)
 BINARY = st.integers(0, 1).map(float)

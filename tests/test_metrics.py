@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from torch import nn
 from torchmetrics.classification import MultilabelJaccardIndex
 
-from zerobev.errors import InputError
-from zerobev.learning.evaluate import evaluate, model_predictor
-from zerobev.learning.metrics import (
+from zerobev.common.errors import InputError
+from zerobev.evaluation.evaluate import evaluate, model_predictor
+from zerobev.evaluation.metrics import (
     Counts,
     bootstrap_interval,
     class_iou,

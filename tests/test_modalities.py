@@ -13,17 +13,17 @@ from scenes_for_tests import box, build, furnished, room
 from transformers import YolosConfig, YolosForObjectDetection
 
 from zerobev.config import CameraConfig
-from zerobev.errors import InputError
-from zerobev.learning.motion import MovingPair, arrow_errors, motion_table, moving_pair, true_flow
-from zerobev.modalities import BevMap, Boxes, Flow, HubDetector, Projector
-from zerobev.modalities.boxes import rendered_boxes
-from zerobev.modalities.flow import flow_field
-from zerobev.modalities.images import LEVELS, binary_images
-from zerobev.modalities.pinhole import PinholeView
+from zerobev.common.errors import InputError
+from zerobev.evaluation.motion import MovingPair, arrow_errors, motion_table, moving_pair, true_flow
+from zerobev.inference import BevMap, Boxes, Flow, HubDetector, Projector
+from zerobev.inference.boxes import rendered_boxes
+from zerobev.inference.flow import flow_field
+from zerobev.inference.images import LEVELS, binary_images
+from zerobev.inference.pinhole import PinholeView
 from zerobev.scenes.moving import movable, moved
-from zerobev.sensors.cameras import Pose
-from zerobev.sensors.gbuffer import RayCaster
-from zerobev.sensors.photograph import Photographer
+from zerobev.geometry.cameras import Pose
+from zerobev.rendering.gbuffer import RayCaster
+from zerobev.rendering.photograph import Photographer
 
 CAMERA = CameraConfig(fpv_px=64, bev_px=40)
 

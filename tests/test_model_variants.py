@@ -14,15 +14,15 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from zerobev.config import AUX, LABELS, SCALES, CameraConfig
-from zerobev.errors import InputError
-from zerobev.learning.losses import dice_loss, zero_bev_loss
+from zerobev.common.errors import InputError
+from zerobev.training.losses import dice_loss, zero_bev_loss
 from zerobev.models import VARIANTS, BevModel, ZeroBEV, build, load_model
-from zerobev.models.__main__ import main, parameters
+from zerobev.report.parameters import main, parameters
 from zerobev.models.fpv_to_bev import reweigh
 from zerobev.models.max_pooling import noisy_or
 from zerobev.models.polar import band_rows
-from zerobev.paper import PARAMETERS_M
-from zerobev.streams.projection import map_points, project
+from zerobev.report.paper import PARAMETERS_M
+from zerobev.geometry.projection import map_points, project
 
 SMOKE = SCALES["smoke"]
 ROWS = list(VARIANTS)

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
-from zerobev.learning.monitor import curves_figure, maps_figure, write_picture
+from zerobev.training.monitor import curves_figure, maps_figure, write_picture
 
 
 class Maps(NamedTuple):

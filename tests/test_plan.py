@@ -14,13 +14,13 @@ from transformers import ResNetConfig, ResNetModel
 
 from zerobev import plan as planning
 from zerobev.config import SCALES, SceneConfig, TextureConfig
-from zerobev.errors import InputError, run_command
-from zerobev.experiments import EXPERIMENTS
+from zerobev.common.errors import InputError, run_command
+from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.models import build
-from zerobev.plan import Network, Plan, kept_bytes, plan
-from zerobev.records import RecordStore
-from zerobev.runs import run, run_key
-from zerobev.workspace import Workspace
+from zerobev.benchmarks.forecast import Network, Plan, kept_bytes, plan
+from zerobev.experiments.records import RecordStore
+from zerobev.experiments.runs import run, run_key
+from zerobev.experiments.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = replace(

@@ -8,8 +8,8 @@ from scenes_for_tests import Thing, box, build, furnished, room, table
 from scipy.stats import chisquare, kstest
 
 from zerobev.config import AgentConfig
-from zerobev.errors import InputError
-from zerobev.sensors.poses import NavigableFloor, navigable_floor
+from zerobev.common.errors import InputError
+from zerobev.rendering.poses import NavigableFloor, navigable_floor
 
 AGENT = AgentConfig()
 SIZE = (4.0, 3.0, 2.5)

@@ -13,15 +13,15 @@ from safetensors import safe_open
 
 import zerobev
 from zerobev.config import SCALES, CameraConfig
-from zerobev.errors import InputError, run_command
-from zerobev.modalities.images import LEVELS
+from zerobev.common.errors import InputError, run_command
+from zerobev.inference.images import LEVELS
 from zerobev.models import build, load_model
 from zerobev.models.depth import DepthNet
-from zerobev.pretraining import DepthPretraining
-from zerobev.project import main, read_labels, read_mask, read_photograph
-from zerobev.streams.projection import project
-from zerobev.weights import DEPTH, FOLDER, ROWS, SCALE, halve, run_of, runs, shipped
-from zerobev.workspace import ROOT, Workspace
+from zerobev.experiments.depth_pretraining import DepthPretraining
+from zerobev.inference.project import main, read_labels, read_mask, read_photograph
+from zerobev.geometry.projection import project
+from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS, SCALE, halve, run_of, runs, shipped
+from zerobev.experiments.workspace import ROOT, Workspace
 
 SIDE = SCALES[SCALE].camera.fpv_px
 CAMERA = CameraConfig(fpv_px=SIDE, bev_px=40)

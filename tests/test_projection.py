@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skimage.morphology import convex_hull_image
 
 from zerobev.config import CameraConfig
-from zerobev.streams.projection import cells_of_pixels, fov_mask, map_points, project, project_mask
+from zerobev.geometry.projection import cells_of_pixels, fov_mask, map_points, project, project_mask
 
 CAMERA = CameraConfig(fpv_px=24, bev_px=20)
 NOWHERE = CAMERA.bev_px**2

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from zerobev.errors import InputError
-from zerobev.learning.metrics import Counts
-from zerobev.records import Record, RecordStore, git_revision, kept, origin
+from zerobev.common.errors import InputError
+from zerobev.evaluation.metrics import Counts
+from zerobev.experiments.records import Record, RecordStore, git_revision, kept, origin
 
 MAPS = np.random.default_rng(0).random((2, 8, 5, 5)) < 0.5
 

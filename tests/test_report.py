@@ -10,13 +10,13 @@ from matplotlib.colors import to_rgb
 from records_for_tests import record
 from scenes_for_tests import box, build, room
 
-from zerobev.beyond import OWN_CLAIMS
-from zerobev.claims import judge
+from zerobev.report.own_rows import OWN_CLAIMS
+from zerobev.report.claims import judge
 from zerobev.config import LABELS, NO_LABEL, CameraConfig
-from zerobev.learning.metrics import Counts
-from zerobev.paper import CLAIMS, TABLES
-from zerobev.records import Record
-from zerobev.report import (
+from zerobev.evaluation.metrics import Counts
+from zerobev.report.paper import CLAIMS, TABLES
+from zerobev.experiments.records import Record
+from zerobev.report.tables import (
     COLORS,
     Checks,
     flat,

@@ -14,8 +14,8 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-from zerobev.errors import InputError, run_command
-from zerobev.reproduce import NotebookError, kernel_settings, main, refresh, report_name, reproduce
+from zerobev.common.errors import InputError, run_command
+from zerobev.report.notebooks import NotebookError, kernel_settings, main, refresh, report_name, reproduce
 
 ROOT = Path(__file__).resolve().parents[1]
 PARAMETERS = 'SCALE = "reduced"\nSCENES = ""'

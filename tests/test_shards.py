@@ -10,14 +10,14 @@ import pytest
 from scenes_for_tests import build, furnished, room
 
 from zerobev.config import CameraConfig, TextureConfig
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.scenes.scene import Scene
-from zerobev.sensors.cameras import Pose
-from zerobev.sensors.gbuffer import RayCaster
-from zerobev.sensors.photograph import Photographer
-from zerobev.streams.projection import fov_mask
-from zerobev.streams.shards import Shard, checksum, write_shard
-from zerobev.streams.views import View, ViewSource
+from zerobev.geometry.cameras import Pose
+from zerobev.rendering.gbuffer import RayCaster
+from zerobev.rendering.photograph import Photographer
+from zerobev.geometry.projection import fov_mask
+from zerobev.data.shards import Shard, checksum, write_shard
+from zerobev.data.views import View, ViewSource
 
 CAMERA = CameraConfig(fpv_px=16, bev_px=10)
 TEXTURE = TextureConfig()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from zerobev.workspace import ROOT
+from zerobev.experiments.workspace import ROOT
 
 SOURCES = sorted((ROOT / "zerobev").rglob("*.py"))
 #: Of a file. The longest are one idea each: a training loop, the arranging of rooms, texture banks.

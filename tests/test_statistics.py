@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.scenes.categories import label_of
 from zerobev.scenes.scene import Instance
 from zerobev.scenes.statistics import HM3DSEM, home_statistics

@@ -13,9 +13,9 @@ from scipy.stats import kstest
 from skimage.feature import local_binary_pattern
 
 from zerobev.config import TextureConfig
-from zerobev.errors import InputError
-from zerobev.streams.sources import KINDS, PHOTOGRAPHS, SourceImages, photograph, procedural
-from zerobev.streams.textures import (
+from zerobev.common.errors import InputError
+from zerobev.data.patterns import KINDS, PHOTOGRAPHS, SourceImages, photograph, procedural
+from zerobev.data.textures import (
     KERNELS,
     TextureBank,
     TextureDraw,

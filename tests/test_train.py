@@ -16,12 +16,12 @@ from safetensors.torch import load_file, load_model
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.learning import train as training
-from zerobev.learning.history import History
-from zerobev.learning.losses import Losses, dice_loss
-from zerobev.learning.schedule import Schedule
-from zerobev.learning.train import dice_objective, train
+from zerobev.training.history import History
+from zerobev.training.losses import Losses, dice_loss
+from zerobev.training.schedule import Schedule
+from zerobev.training.train import dice_objective, train
 
 CONFIG = TrainConfig(steps=20, learning_rate=0.01, decay_every=8, validate_every=6, warmup=3, patience=1, batch=4)
 

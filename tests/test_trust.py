@@ -10,20 +10,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from zerobev.benchmark import recorded_benchmark
-from zerobev.beyond import OWN_CLAIMS
-from zerobev.claims import compare, judge
+from zerobev.benchmarks.run import recorded_benchmark
+from zerobev.report.own_rows import OWN_CLAIMS
+from zerobev.report.claims import compare, judge
 from zerobev.config import SCALES
-from zerobev.experiments import EXPERIMENTS
-from zerobev.learning.metrics import Counts
-from zerobev.learning.motion import recorded_motion
-from zerobev.learning.unseen import recorded_unseen
-from zerobev.paper import CLAIMS, RATIOS, TABLES
-from zerobev.records import Record, RecordStore
-from zerobev.report import table
-from zerobev.runs import recorded
-from zerobev.summary import TABLES as TITLES
-from zerobev.workspace import ROOT, Workspace
+from zerobev.experiments.registry import EXPERIMENTS
+from zerobev.evaluation.metrics import Counts
+from zerobev.evaluation.motion import recorded_motion
+from zerobev.evaluation.unseen import recorded_unseen
+from zerobev.report.paper import CLAIMS, RATIOS, TABLES
+from zerobev.experiments.records import Record, RecordStore
+from zerobev.report.tables import table
+from zerobev.experiments.runs import recorded
+from zerobev.report.page import TABLES as TITLES
+from zerobev.experiments.workspace import ROOT, Workspace
 
 REPORTS = [ROOT / "reports" / scale for scale in SCALES if (ROOT / "reports" / scale / "records").is_dir()]
 PAPER = ROOT.parent / "shared/paper/zero-bev.tex"
@@ -60,9 +60,9 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
 @pytest.mark.parametrize(
     ("read", "starts_with"),
     [
-        (recorded_benchmark, "zerobev.benchmark.measure"),
-        (recorded_motion, "zerobev.learning.motion.ensure_homes"),
-        (recorded_unseen, "zerobev.learning.unseen.ensure_homes"),
+        (recorded_benchmark, "zerobev.benchmarks.run.measure"),
+        (recorded_motion, "zerobev.evaluation.motion.ensure_homes"),
+        (recorded_unseen, "zerobev.evaluation.unseen.ensure_homes"),
     ],
 )
 def test_what_is_measured_once_was_measured_by_this_code(monkeypatch, read, starts_with: str):

@@ -10,11 +10,11 @@ from scenes_for_tests import build, furnished, room
 from scipy import ndimage
 
 from zerobev.config import LABELS, CameraConfig, TextureConfig
-from zerobev.errors import InputError
-from zerobev.streams.projection import cells_of_pixels, map_points, project
-from zerobev.streams.shards import Shard, write_shard
-from zerobev.streams.textures import MODSEM_DRAWS, TextureBank
-from zerobev.streams.tuples import (
+from zerobev.common.errors import InputError
+from zerobev.geometry.projection import cells_of_pixels, map_points, project
+from zerobev.data.shards import Shard, write_shard
+from zerobev.data.textures import MODSEM_DRAWS, TextureBank
+from zerobev.data.samples import (
     DepthProjTuples,
     ModSemTuples,
     SemanticTuples,
@@ -27,7 +27,7 @@ from zerobev.streams.tuples import (
     semantic_sample,
     view_sample,
 )
-from zerobev.streams.views import View, ViewSource
+from zerobev.data.views import View, ViewSource
 
 CAMERA = CameraConfig(fpv_px=24, bev_px=20)
 TEXTURE = TextureConfig(tiles=4)

@@ -9,11 +9,11 @@ from scenes_for_tests import build, furnished
 
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.learning import unseen
-from zerobev.learning.metrics import Counts
-from zerobev.learning.unseen import MODALITIES, evaluate_unseen, unseen_masks, unseen_table
+from zerobev.evaluation.metrics import Counts
+from zerobev.evaluation.unseen import MODALITIES, evaluate_unseen, unseen_masks, unseen_table
 from zerobev.scenes.hm3dsem_writer import write_scene
-from zerobev.streams.projection import cells_of_pixels
-from zerobev.streams.views import View, ViewSource
+from zerobev.geometry.projection import cells_of_pixels
+from zerobev.data.views import View, ViewSource
 
 CAMERA = CameraConfig(fpv_px=64, bev_px=40)
 

@@ -10,9 +10,9 @@ from safetensors.torch import save_file
 from transformers import ResNetConfig, ResNetForImageClassification
 
 from zerobev.config import SCALES
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.models.backbone import RgbEncoder
-from zerobev.models.weights import load_backbone, torchvision_name
+from zerobev.models.backbone_weights import load_backbone, torchvision_name
 
 SMOKE, PAPER = SCALES["smoke"].model, SCALES["paper"].model
 SMALL = replace(SMOKE, depths=(2, 1, 2, 1), channels=(16, 32, 48, 64), stem_channels=16, stem_stride=4)

@@ -1,12 +1,12 @@
 """Zero-BEV: zero-shot projection of any first-person modality to a bird's-eye-view map.
 
-`zerobev.load().project(rgb, modality)` is all that most uses need; see `zerobev.modalities`.
+`zerobev.load().project(rgb, modality)` is all that most uses need; see `zerobev.inference`.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from zerobev.modalities import BevArrows, BevMap, Boxes, Flow, Projector, load
+    from zerobev.inference import BevArrows, BevMap, Boxes, Flow, Projector, load
 
 __version__ = "0.1.0"
 
@@ -16,7 +16,7 @@ __all__ = ["BevArrows", "BevMap", "Boxes", "Flow", "Projector", "load"]
 def __getattr__(name: str) -> Any:
     # imported when first asked for: most commands of the package need no network
     if name in __all__:
-        import zerobev.modalities
+        import zerobev.inference
 
-        return getattr(zerobev.modalities, name)
+        return getattr(zerobev.inference, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

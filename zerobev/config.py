@@ -7,7 +7,7 @@ not name here (field of view, map extent, Dice loss, alpha, Adam, batch 16) is t
 import math
 from dataclasses import dataclass, field
 
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 
 #: The eight evaluated classes, in the column order of the paper's tables.
 LABELS = ("wall", "floor", "chair", "sofa", "bed", "plant", "toilet", "tv")
@@ -148,7 +148,7 @@ class Scale:
     #: share of the *Synth* samples in which all that is raised is painted from above (not in the paper)
     upright: float = 0.0
     test_views: int | None = None  #: of each test scene, the first ones, that networks are evaluated on; None: all
-    #: first weights of the RGB backbones, as `models.weights.load_backbone` takes them; empty: the depth estimator's
+    #: first weights of the RGB backbones, as `models.backbone_weights.load_backbone` takes them; empty: the depth estimator's
     backbone: str = ""
     vpn_backbone: str = ""
 

@@ -17,11 +17,11 @@ from transformers.image_processing_base import ImageProcessingMixin
 from transformers.utils import IMAGE_PROCESSOR_NAME, cached_file
 
 from zerobev.config import CameraConfig, ModelConfig
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
-from zerobev.models.checkpoint import BevModel
+from zerobev.models.base import BevModel
 from zerobev.models.decoder import convolution, upsample
-from zerobev.sensors.cameras import fpv_rays
+from zerobev.geometry.cameras import fpv_rays
 
 #: Nothing that `DepthNet` predicts is farther than this, metres.
 FARTHEST_M = 50.0
@@ -99,7 +99,7 @@ class HubDepth(nn.Module):
         """The depth model in a folder or under a name on the Hugging Face hub, in evaluation mode.
 
         The image normalisation is that of the image processor beside it, if there is one, else ImageNet's.
-        A DPT predicts metres only after fine-tuning (`zerobev.learning.depth`); nothing in its files tells.
+        A DPT predicts metres only after fine-tuning (`zerobev.training.depth`); nothing in its files tells.
         Raises `InputError` where there is no depth model, and for a Depth Anything that is not metric.
         """
         try:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.models.band_transformer import BandAttention, BandTransformer
 from zerobev.models.polar import PolarToCartesian, band_rows, floor_row
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 
 
 def band_rows(camera: CameraConfig, edges_m: tuple[float, ...]) -> list[range]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from zerobev.config import LABELS, CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.checkpoint import BevModel, Projection
+from zerobev.models.base import BevModel, Projection
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev
 from zerobev.models.pyramid import FeaturePyramid

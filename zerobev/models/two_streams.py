@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.checkpoint import IMAGES_A_PASS, BevModel, Projection
+from zerobev.models.base import IMAGES_A_PASS, BevModel, Projection
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev, reweigh
 from zerobev.models.pyramid import FeaturePyramid

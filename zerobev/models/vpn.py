@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from zerobev.config import LABELS, CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder
-from zerobev.models.checkpoint import BevModel, Projection
+from zerobev.models.base import BevModel, Projection
 from zerobev.models.decoder import convolution, upsample
 
 POOLED_SIDES = (1, 2, 3, 6)  #: of the pyramid pooling

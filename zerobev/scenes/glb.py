@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 
 #: Vertex attribute with UV coordinates as they stand in the file; trimesh leaves names with an underscore alone.
 RAW_UV = "_TEXCOORD_0"

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.scenes.categories import label_of
 from zerobev.scenes.glb import RAW_UV, placed_meshes, read_glb
 from zerobev.scenes.scene import Instance, Scene

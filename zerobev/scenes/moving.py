@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.scenes.scene import Scene
 
 _SAME_M = 1e-3  # faces of the two meshes with their centres this close are one face

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from zerobev.config import LABELS, NO_LABEL
-from zerobev.errors import InputError
+from zerobev.common.errors import InputError
 from zerobev.scenes.scene import Instance
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from zerobev.config import CameraConfig
 from zerobev.models.band_transformer import sinusoids
 from zerobev.models.fpv_to_bev import columns
-from zerobev.sensors.cameras import fpv_rays
-from zerobev.streams.projection import map_points
+from zerobev.geometry.cameras import fpv_rays
+from zerobev.geometry.projection import map_points
 
 
 def positions(depth: Tensor, camera: CameraConfig) -> Tensor:

@@ -1,0 +1,221 @@
+"""Scenes -> shards: `python -m zerobev.data.generate --scenes DIR --out DIR --views N --scale S`.
+
+One shard a scene, in parallel over scenes (`--workers`, or the workers of a dask cluster with `--dask`). A
+shard depends on the scene, the configuration, the number of views and the seed alone, so any number of
+workers writes the same bytes; a run that was killed goes on where it was, since a shard that is there is
+whole. `--verify` holds what is there against the manifest.
+"""
+
+import argparse
+import gc
+import json
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+
+from zerobev import config
+from zerobev.config import CameraConfig, TextureConfig
+from zerobev.common.errors import InputError, run_command
+from zerobev.common.parallel import cluster, run_jobs
+from zerobev.common.progress import progress
+from zerobev.scenes.hm3dsem import read_scene, split_scenes
+from zerobev.common.storage import write_json
+from zerobev.data.shards import Shard, checksum, recorded_with, write_shard
+from zerobev.data.views import ViewSource
+
+_PARTS = ("train", "validation", "test")
+_MANIFEST = "manifest.json"
+
+
+def shard_path(scene_folder: Path, out: Path) -> Path:
+    """Where the shard of a scene belongs."""
+    return out / f"{scene_folder.name}.h5"
+
+
+def generate_shard(
+    scene_folder: Path, out: Path, views: int, camera: CameraConfig, texture: TextureConfig, seed: int
+) -> Path:
+    """Record `views` views of one scene, unless its shard is there; returns the shard's path.
+
+    Raises `InputError` for a broken scene, and for a shard that is damaged or belongs to another run.
+    """
+    path = shard_path(scene_folder, out)
+    if path.exists():
+        _check_run(path, views, camera, texture, seed)
+        return path
+    if views < 1:
+        raise InputError(f"views: expected 1 or more, found {views}")
+    for unfinished in out.glob(f".{path.stem}.*.part.h5"):  # of a run that was killed
+        unfinished.unlink(missing_ok=True)
+    scene = read_scene(scene_folder)
+    rng = np.random.default_rng(_scene_seed(scene_folder, seed))
+    source = ViewSource(scene, camera, texture, rng)
+    write_shard(path, scene, (source.draw() for _ in range(views)), camera, texture, seed)
+    return path
+
+
+def generate(
+    scene_folders: list[Path],
+    out: Path,
+    views: int,
+    camera: CameraConfig,
+    texture: TextureConfig,
+    seed: int,
+    workers: int = 1,
+) -> dict[str, str]:
+    """Record every scene into `out` and write `manifest.json` there: configuration, seeds, SHA-256 of each shard.
+
+    `workers` is a number of processes; under `joblib.parallel_config` with another back end, that one decides. A
+    broken scene is skipped; a shard of another run, or one that is not what the manifest lists, is left alone.
+    Returns what was wrong, scene name -> message; empty when all went well. Raises `InputError` where `out` has a
+    manifest of another run.
+    """
+    run = {**recorded_with(camera, texture), "seed": seed, "views": views}
+    listed = _listed(out, run)
+    there = [folder for folder in scene_folders if shard_path(folder, out).exists()]
+    missing = [folder for folder in scene_folders if folder not in there]
+    found: dict[Path, str | InputError] = {}
+    for folders, sums, what in (there, listed, "shards that are there"), (missing, {}, f"views of {out.name}"):
+        jobs = (
+            joblib.delayed(_attempt)(
+                folder, out, views, camera, texture, seed, sums.get(shard_path(folder, out).name, {}).get("sha256")
+            )
+            for folder in folders
+        )
+        found |= zip(folders, list(run_jobs(jobs, workers, what, len(folders))))  # to its end: joblib counts on it
+    recorded = {
+        shard_path(folder, out).name: {"seed": _scene_seed(folder, seed), "sha256": outcome}
+        for folder, outcome in found.items()
+        if isinstance(outcome, str)
+    }
+    write_json(out / _MANIFEST, {**run, "shards": listed | recorded})
+    return {folder.name: str(outcome) for folder, outcome in found.items() if isinstance(outcome, InputError)}
+
+
+def _attempt(
+    folder: Path,
+    out: Path,
+    views: int,
+    camera: CameraConfig,
+    texture: TextureConfig,
+    seed: int,
+    listed: str | None,
+) -> str | InputError:
+    """SHA-256 of the scene's shard (`listed`, if that is given), recorded now if need be, or what is wrong with it."""
+    try:
+        path = generate_shard(folder, out, views, camera, texture, seed)
+        if listed:
+            _check_sum(path, listed)
+        return checksum(path)
+    except InputError as error:
+        return error
+    finally:
+        # meshes refer to themselves: without this they pile up until joblib takes the worker's memory for a leak
+        gc.collect()
+
+
+def _scene_seed(scene_folder: Path, seed: int) -> list[int]:
+    """Seed of a scene's views: its name is part of it, so that they do not depend on which other scenes there are."""
+    return [seed, zlib.crc32(scene_folder.name.encode())]
+
+
+def _listed(out: Path, run: dict[str, Any]) -> dict[str, Any]:
+    """What the manifest in `out` says of each shard, if there is a manifest: it has to be that of `run`."""
+    path = out / _MANIFEST
+    if not path.exists():
+        return {}
+    manifest = _read_manifest(out)
+    shards = manifest.pop("shards")
+    if manifest != run:
+        raise InputError(f"{path}: expected a manifest of {run}, found one of {manifest}")
+    return shards
+
+
+def verify(out: Path) -> list[str]:
+    """Hold the shards in `out` against its manifest; returns a message for each that is missing, damaged or foreign.
+
+    Raises `InputError` for a manifest that is missing or not one.
+    """
+    manifest = _read_manifest(out)
+    camera = CameraConfig(**manifest["camera"])
+    texture = TextureConfig(modsem_share=manifest["modsem_share"])
+    listed = manifest["shards"]
+    names = sorted({path.name for path in out.glob("[!.]*.h5")} | set(listed))
+    problems = []
+    for name in progress(names, f"shards of {out.name}", "shard", len(names)):
+        path = out / name
+        try:
+            if name not in listed:
+                raise InputError(f"{path}: expected a shard that the manifest lists, found one that it does not")
+            if not path.exists():
+                raise InputError(f"{path}: expected a shard, found nothing")
+            _check_sum(path, listed[name]["sha256"])
+            _check_run(path, manifest["views"], camera, texture, manifest["seed"])
+        except InputError as error:
+            problems.append(str(error))
+    return problems
+
+
+def _check_sum(path: Path, expected: str) -> None:
+    if (found := checksum(path)) != expected:
+        raise InputError(f"{path}: expected SHA-256 {expected}, found {found}")
+
+
+def _check_run(path: Path, views: int, camera: CameraConfig, texture: TextureConfig, seed: int) -> None:
+    found = Shard(path, camera, texture)
+    if (len(found), found.seed) != (views, seed):
+        raise InputError(f"{path}: expected {views} views with seed {seed}, found {len(found)} with seed {found.seed}")
+
+
+def _read_manifest(out: Path) -> dict[str, Any]:
+    path = out / _MANIFEST
+    try:
+        manifest = json.loads(path.read_text())
+        CameraConfig(**manifest["camera"])
+        if not all(isinstance(entry["sha256"], str) for entry in manifest["shards"].values()):
+            raise TypeError("a shard without SHA-256")
+        return {key: manifest[key] for key in ("camera", "modsem_share", "seed", "views", "shards")}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        found = "nothing" if isinstance(error, FileNotFoundError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}: expected a manifest of shards, found {found}") from None
+
+
+def main() -> None:
+    """Parse the command line; record, or verify, the shards of every split below `--out`."""
+    parser = argparse.ArgumentParser(prog="python -m zerobev.data.generate", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
+    parser.add_argument("--scenes", type=Path, help="folder in HM3DSem layout")
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(config.SCALES)}")
+    parser.add_argument("--views", type=int, help="per scene; default: the scale's")
+    parser.add_argument("--seed", type=int, default=0)
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=int, default=1, help="processes on this machine")
+    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster that sees both folders")
+    parser.add_argument("--verify", action="store_true", help="check the shards in --out instead")
+    options = parser.parse_args()
+    if options.verify:
+        problems = [problem for part in _PARTS for problem in verify(options.out / part)]
+        if problems:
+            sys.exit("\n".join(problems))
+        return
+    if options.scenes is None:
+        parser.error("--scenes is required, except with --verify")
+    scale = config.scale(options.scale)
+    views = scale.scenes.views if options.views is None else options.views
+    split = split_scenes(options.scenes)
+    broken: dict[str, str] = {}
+    with cluster(options.dask):
+        for part in _PARTS:
+            folders = list(getattr(split, part))
+            out = options.out / part
+            broken |= generate(folders, out, views, scale.camera, scale.texture, options.seed, options.workers)
+    if broken:
+        sys.exit("\n".join(f"skipped {name}: {message}" for name, message in broken.items()))
+
+
+if __name__ == "__main__":
+    run_command(main)

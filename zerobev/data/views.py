@@ -1,0 +1,101 @@
+"""A view: everything the sensors record at one pose, and the drawing of poses worth recording."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from zerobev.config import AgentConfig, CameraConfig, TextureConfig
+from zerobev.common.errors import InputError
+from zerobev.scenes.scene import Scene
+from zerobev.geometry.cameras import Pose
+from zerobev.rendering.gbuffer import RayCaster
+from zerobev.rendering.photograph import Photographer
+from zerobev.rendering.poses import navigable_floor
+from zerobev.geometry.projection import fov_mask
+from zerobev.data.textures import MODSEM_DRAWS, modsem_textures
+
+_GLANCE_PX = 64  # a larger image is cast only where one of this size sees enough of the map
+_TRIES = 50  # poses drawn for one view before the scene is given up
+
+
+@dataclass(frozen=True)
+class View:
+    """One pose, complete: any sample of any stream is made of it by look-up. H pixels and M cells a side."""
+
+    rgb: np.ndarray  #: (H, H, 3) uint8 photograph
+    depth: np.ndarray  #: (H, H) float32 planar depth, metres, 0 for nothing
+    fpv_texel: np.ndarray  #: (H, H, 3) int16 chart, row, column; chart -1 for nothing
+    fpv_instance: np.ndarray  #: (H, H) uint16
+    fpv_modsem: np.ndarray  #: (H, H) uint8: bit b is white in draw b of the scene's *Mod. Sem.* textures
+    bev_texel: np.ndarray  #: (M, M, 3) int16
+    bev_instance: np.ndarray  #: (M, M) uint16
+    bev_modsem: np.ndarray  #: (M, M) uint8
+    bev_height: np.ndarray  #: (M, M) float32, metres above the floor
+    fov: np.ndarray  #: (M, M) bool: cells inside the field of view
+    pose: np.ndarray  #: (4,) float64: x, y, height of the floor (metres, world), yaw (radians)
+
+
+class ViewSource:
+    """Draws views of one scene. Poses do not depend on `texture`, which is that of the *Mod. Sem.* draws."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: CameraConfig,
+        texture: TextureConfig,
+        rng: np.random.Generator,
+        agent: AgentConfig | None = None,
+    ) -> None:
+        self._agent = agent or AgentConfig()
+        self._camera = camera
+        self._rng = rng
+        self.scene = scene
+        self.floor = navigable_floor(scene, self._agent, rng)
+        self._caster = RayCaster(scene)
+        self._photographer = Photographer(scene, camera)
+        drawn = rng.spawn(1)[0]
+        draws = (modsem_textures(chart, texture, drawn) for chart in scene.chart_instance)
+        bit = (1 << np.arange(MODSEM_DRAWS)).astype(np.uint8)
+        bits = (np.einsum("drc,d->rc", white.view(np.uint8), bit).ravel() for white in draws)
+        self._modsem = np.concatenate([*bits, [np.uint8(0)]])  # what comes last is nothing
+
+    def draw(self) -> View:
+        """The view at a fresh pose; poses that face a wall are refused.
+
+        Raises `InputError` where no pose of the scene sees enough of the map.
+        """
+        for _ in range(_TRIES):
+            pose = self.floor.draw(self._rng)
+            view = self.at(pose)
+            if view is not None:
+                return view
+        raise InputError(
+            f"scene {self.scene.name}: expected a view of at least {self._agent.least_view:.0%} of the map, "
+            f"found none in {_TRIES} poses"
+        )
+
+    def at(self, pose: Pose) -> View | None:
+        """The view at `pose`, or None where it sees too little of the map."""
+        if self._camera.fpv_px > _GLANCE_PX and self._is_blocked(replace(self._camera, fpv_px=_GLANCE_PX), pose):
+            return None
+        fpv = self._caster.fpv(pose, self._camera)
+        fov = fov_mask(fpv.distance, self._camera)
+        if fov.mean() < self._agent.least_view:
+            return None
+        bev = self._caster.bev(pose, self._camera)
+        return View(
+            rgb=self._photographer.take(pose),
+            depth=fpv.distance,
+            fpv_texel=fpv.texel,
+            fpv_instance=fpv.instance,
+            fpv_modsem=self._modsem.take(fpv.atlas),
+            bev_texel=bev.texel,
+            bev_instance=bev.instance,
+            bev_modsem=self._modsem.take(bev.atlas),
+            bev_height=bev.distance,
+            fov=fov,
+            pose=np.array([pose.x, pose.y, pose.floor_z, pose.yaw]),
+        )
+
+    def _is_blocked(self, camera: CameraConfig, pose: Pose) -> bool:
+        return fov_mask(self._caster.fpv(pose, camera).distance, camera).mean() < self._agent.least_view

@@ -1,0 +1,207 @@
+"""Flow on the map against true motion: `python -m zerobev.evaluation.motion --scenes DIR [--pairs N] [--json FILE]`.
+
+In generated homes an object is moved between two photographs of a camera that stands still, so that the motion of each
+of its pixels on the map is known. Rows are projections: P^-1 with estimated depth (a.2), and the networks that ship.
+"""
+
+import argparse
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from scipy.stats import bootstrap
+
+from zerobev.config import AgentConfig, CameraConfig
+from zerobev.common.errors import InputError, run_command
+from zerobev.inference.bev_map import BevArrows
+from zerobev.inference.flow import Flow, flow_field
+from zerobev.inference.projector import GEOMETRIC, Projector, load
+from zerobev.common.progress import progress
+from zerobev.experiments.records import kept
+from zerobev.scenes.hm3dsem import find_scenes, read_scene
+from zerobev.scenes.homes import ensure_homes
+from zerobev.scenes.moving import movable, moved
+from zerobev.scenes.scene import Scene
+from zerobev.rendering.gbuffer import RayCaster
+from zerobev.rendering.photograph import Photographer
+from zerobev.rendering.poses import navigable_floor
+from zerobev.common.storage import write_json
+from zerobev.geometry.projection import map_points
+from zerobev.inference.shipped_weights import ROWS, shipped_runs
+from zerobev.experiments.workspace import Workspace
+
+#: Side of the photographs: flow needs finer ones than the networks do.
+PHOTOGRAPH_PX = 256
+_SHIFT_M = (0.2, 0.6)  # an object moves this far
+_SIZE = (0.01, 0.4)  # of an object, as a share of the photograph
+_SPACING_PX = 16  # of vectors
+_TRIES = 100
+
+
+@dataclass(frozen=True, eq=False)
+class MovingPair:
+    """Two photographs between which one object moves. P pixels a side."""
+
+    first: np.ndarray  #: (P, P, 3) uint8
+    second: np.ndarray  #: (P, P, 3) uint8
+    on_object: np.ndarray  #: (P, P) bool: pixels of `first` that see the object
+    point_m: np.ndarray  #: (P, P, 2) float64: map position, right and forward, of what each pixel of `first` sees
+    flow_px: np.ndarray  #: (P, P, 2) float64: true flow, right and down
+    motion_m: np.ndarray  #: (2,) float64: true motion on the map, right and forward
+
+
+def moving_pair(scene: Scene, camera: CameraConfig, rng: np.random.Generator) -> MovingPair:
+    """A random object of a generated home, seen by a random camera, moved by a random shift along the floor.
+
+    The object keeps what is seen of it from above, so that it did not move into a wall or off the map. Raises
+    `InputError` where no object of the home can be moved like that.
+    """
+    fine = replace(camera, fpv_px=PHOTOGRAPH_PX)
+    ids, caster = movable(scene), RayCaster(scene)
+    floor = navigable_floor(scene, AgentConfig(), rng)
+    for _ in range(_TRIES if ids else 0):
+        pose = floor.draw(rng)
+        share = {i: np.mean(caster.fpv(pose, camera).instance == i) for i in ids}
+        seen = [i for i in ids if _SIZE[0] < share[i] < _SIZE[1]]
+        if not seen:
+            continue
+        chosen = int(rng.choice(seen))
+        angle, length = rng.uniform(-np.pi, np.pi), rng.uniform(*_SHIFT_M)
+        motion = length * np.array([np.cos(angle), np.sin(angle), 0.0])
+        after = moved(scene, chosen, pose.world_R_map @ motion)
+        caster_after = RayCaster(after)
+        cells = [np.sum(one.bev(pose, camera).instance == chosen) for one in (caster, caster_after)]
+        visible = np.mean(caster_after.fpv(pose, camera).instance == chosen)
+        if cells[0] < 3 or cells[1] < 0.9 * cells[0] or visible < share[chosen] / 2:
+            continue
+        seen_first = caster.fpv(pose, fine)
+        points = map_points(torch.from_numpy(seen_first.distance).double(), fine).numpy()
+        on_object = seen_first.instance == chosen
+        first, second = (Photographer(one, fine).take(pose) for one in (scene, after))
+        flow = true_flow(points, motion, fine) * on_object[..., None]
+        return MovingPair(first, second, on_object, points[..., :2], flow, motion[:2])
+    raise InputError(f"scene {scene.name}: expected an object that can be seen to move, found none in {_TRIES} views")
+
+
+def true_flow(points: np.ndarray, motion: np.ndarray, camera: CameraConfig) -> np.ndarray:
+    """Points (H, W, 3) of the map frame that move by `motion` (3,), metres -> (H, W, 2) pixels right and down."""
+    pixels = []
+    for x, y, z in (np.moveaxis(points, -1, 0), np.moveaxis(points + motion, -1, 0)):
+        depth = np.where(y > 0, y, np.nan)
+        pixels.append(camera.focal_px * np.stack([x, camera.height_m - z], axis=-1) / depth[..., None])
+    return np.nan_to_num(pixels[1] - pixels[0])
+
+
+def arrow_errors(projector: Projector, pair: MovingPair, field: np.ndarray) -> pd.DataFrame | None:
+    """Errors of the arrows of a flow field that start on the object; None where no vector does.
+
+    One line a vector, metres: `start` and `end`, distances to their true places, and `motion`, that between the arrow
+    and the true one. An arrow without a place on the map has NaN.
+    """
+    on_object = np.where(pair.on_object[..., None], field, 0).astype(np.float64)
+    try:
+        flow = Flow.of(on_object, pair.second, spacing_px=_SPACING_PX)
+    except InputError:  # the object's flow is all below a pixel
+        return None
+    arrows = projector.project(pair.first, flow)
+    assert isinstance(arrows, BevArrows)  # as of every flow
+    column, row = np.floor(flow.start_px).astype(int).T
+    start = pair.point_m[row, column]
+    predicted = {"start": arrows.start_m - start, "end": arrows.end_m - start - pair.motion_m}
+    predicted["motion"] = arrows.end_m - arrows.start_m - pair.motion_m
+    return pd.DataFrame({name: np.linalg.norm(error, axis=1) for name, error in predicted.items()})
+
+
+def evaluate_motion(pairs: Iterable[MovingPair]) -> pd.DataFrame:
+    """Mean errors of each pair: columns pair, flow ("true" or "tvl1"), row, vectors, missing, start, end, motion.
+
+    The row "still" is an arrow of length zero at the true place: its error is how far the object moved.
+    """
+    projectors = {row: load(row) for row in (GEOMETRIC, *ROWS)}
+    lines = []
+    for number, pair in enumerate(pairs):
+        fields = {"true": pair.flow_px, "tvl1": flow_field(pair.first, pair.second)}
+        length = float(np.linalg.norm(pair.motion_m))
+        for flow, field in fields.items():
+            lines.append((number, flow, "still", 0, 0.0, 0.0, length, length))
+            for row, projector in projectors.items():
+                errors = arrow_errors(projector, pair, field)
+                if errors is not None:
+                    missing = errors["motion"].isna().mean()
+                    lines.append((number, flow, row, len(errors), missing, *errors.mean()))
+    columns = ["pair", "flow", "row", "vectors", "missing", "start", "end", "motion"]
+    return pd.DataFrame(lines, columns=columns)
+
+
+def motion_table(errors: pd.DataFrame) -> pd.DataFrame:
+    """Means over pairs, in metres, with 90 % intervals from resampling pairs; one line a flow and row."""
+    lines = []
+    for (flow, row), group in errors.groupby(["flow", "row"], sort=False):
+        cells = []
+        for name in ("start", "end", "motion"):
+            values = group[name].dropna().to_numpy()
+            if len(values) < 2 or not np.ptp(values):
+                cells.append(f"{values.mean():.2f}" if len(values) else "")
+                continue
+            interval = bootstrap(
+                (values,), np.mean, confidence_level=0.9, method="percentile", rng=np.random.default_rng(0)
+            ).confidence_interval
+            cells.append(f"{values.mean():.2f} [{interval.low:.2f}, {interval.high:.2f}]")
+        lines.append((flow, row, len(group), int(group["vectors"].sum()), round(group["missing"].mean(), 2), *cells))
+    columns = ["flow", "row", "pairs", "vectors", "missing", "start [m]", "end [m]", "motion [m]"]
+    return pd.DataFrame(lines, columns=columns).set_index(["flow", "row"])
+
+
+def moving_pairs(folders: list[Path], count: int, seed: int) -> Iterator[MovingPair]:
+    """`count` pairs, a home after the other; homes without an object that can be moved are passed over."""
+    found = 0
+    rng, camera = np.random.default_rng(seed), load(GEOMETRIC).camera
+    for folder in progress(folders, "homes", "home", len(folders)):
+        if found == count:
+            return
+        scene = read_scene(folder)
+        try:
+            pair = moving_pair(scene, camera, rng)
+        except InputError:  # nothing in it can be moved
+            continue
+        yield pair
+        found += 1
+
+
+def recorded_motion(workspace: Workspace, count: int = 32) -> pd.DataFrame:
+    """Errors of `count` pairs of a workspace's generated test homes: read where they are recorded, else computed.
+
+    The record `motion.json` of the report names the weights that it is of; those of other weights are computed again.
+    """
+    homes = list(workspace.split.test)
+
+    def compute() -> dict[str, list]:
+        ensure_homes(homes, workspace.scale.scenes.seed, 1)
+        return evaluate_motion(moving_pairs(homes, count, seed=0)).to_dict(orient="list")
+
+    identity = {"weights": shipped_runs(), "pairs": count, "scenes": asdict(workspace.scale.scenes)}
+    return pd.DataFrame(kept(workspace.reports / "motion.json", identity, compute))
+
+
+def main() -> None:
+    """Parse the command line, move objects, print the table."""
+    parser = argparse.ArgumentParser(prog="python -m zerobev.evaluation.motion", description=__doc__)
+    parser.add_argument("--scenes", type=Path, required=True, help="folder of generated homes; its val/ is used")
+    parser.add_argument("--pairs", type=int, default=32, help="at most one a home")
+    parser.add_argument("--seed", type=int, default=0, help="of poses, objects and shifts")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the errors of every pair there")
+    options = parser.parse_args()
+    folders = find_scenes(options.scenes)["val"]
+    errors = evaluate_motion(moving_pairs(folders, options.pairs, options.seed))
+    if errors.empty:
+        raise InputError(f"{options.scenes}: expected homes in which an object can be moved, found none")
+    print(motion_table(errors).to_string())
+    if options.json:
+        write_json(options.json, errors.to_dict(orient="records"))
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,114 @@
+"""The shipped weights on any homes: `python -m zerobev.evaluation.evaluate --scenes DIR [--views N] [--json FILE]`.
+
+The networks were trained on generated homes alone, so every annotated scene of the folder is a test scene. Views are
+rendered on the spot. Rows as in Table 1: projection with true depth (a.1) and with estimated depth (a.2), and the
+networks that ship.
+"""
+
+import argparse
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from zerobev.config import LABELS, CameraConfig, TextureConfig
+from zerobev.common.errors import InputError
+from zerobev.evaluation.evaluate import Predictor, evaluate
+from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
+from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.common.progress import progress
+from zerobev.scenes.hm3dsem import find_scenes, read_scene
+from zerobev.common.storage import write_json
+from zerobev.geometry.projection import project
+from zerobev.data.samples import class_masks, collate, view_sample
+from zerobev.data.views import ViewSource
+from zerobev.inference.shipped_weights import ROWS, run_of, shipped
+
+ORACLE = "a.1"
+METHODS = {ORACLE: "P^-1 with true depth", GEOMETRIC: "P^-1 with estimated depth"} | {
+    row: f"Zero-BEV ({row})" for row in ROWS
+}
+
+
+def render_views(folder: Path, number: int, views: int, camera: CameraConfig, seed: int) -> dict[str, Tensor]:
+    """`views` fresh views of a scene as one batch, with the eight classes as modalities; `scene` is `number`."""
+    scene = read_scene(folder)
+    rng = np.random.default_rng([seed, zlib.crc32(folder.name.encode())])
+    source = ViewSource(scene, camera, TextureConfig(), rng)
+    drawn = [source.draw() for _ in range(views)]
+    return collate([view_sample(view, camera, number, *class_masks(view, scene.instance_label)) for view in drawn])
+
+
+def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict[str, Counts], dict[str, str]]:
+    """Intersections and unions of every row of `METHODS` on `views` views of each scene.
+
+    Returns the counts, and what was wrong with scenes that could not be read or rendered, name -> message: these
+    count nothing. Raises `InputError` where that is all of them.
+    """
+    if views < 1:
+        raise InputError(f"views: expected 1 or more, found {views}")
+    projectors = {row: load(row) for row in (GEOMETRIC, *ROWS)}
+    camera = projectors[GEOMETRIC].camera
+    methods: dict[str, Predictor] = {ORACLE: lambda batch: project(batch["zero"], batch["depth"], camera) > 0}
+    methods |= {row: projector.predict for row, projector in projectors.items()}
+    total = {row: Counts.empty(len(folders), len(LABELS)) for row in METHODS}
+    broken: dict[str, str] = {}
+    for number, folder in enumerate(progress(folders, "homes", "home", len(folders))):
+        try:
+            batch = render_views(folder, number, views, camera, seed)
+        except InputError as error:
+            broken[folder.name] = str(error)
+            continue
+        for row, predict in methods.items():
+            total[row] += evaluate(predict, [batch], len(folders), len(LABELS))
+    if len(broken) == len(folders):
+        raise InputError("; ".join(broken.values()))
+    good = [number for number, folder in enumerate(folders) if folder.name not in broken]
+    return {row: Counts(c.intersection[good], c.union[good]) for row, c in total.items()}, broken
+
+
+def results_table(counts: dict[str, Counts]) -> pd.DataFrame:
+    """IoU in percent, one line a row; averages with their 90 % intervals over scenes."""
+    lines = []
+    for row, one in counts.items():
+        averages = []
+        for statistic in (class_iou, pixel_iou):
+            low, high = bootstrap_interval([one], statistic, np.random.default_rng(0))
+            averages.append(f"{100 * one.value(statistic):.1f} [{100 * low:.1f}, {100 * high:.1f}]")
+        lines.append((row, METHODS[row], *(100 * one.iou_per_class()).round(1), *averages))
+    return pd.DataFrame(lines, columns=["row", "method", *LABELS, "class avg.", "pixel avg."]).set_index("row")
+
+
+def main() -> None:
+    """Parse the command line, evaluate, print the table; exit code 1 if a scene was skipped."""
+    parser = argparse.ArgumentParser(prog="python -m zerobev.evaluation.evaluate", description=__doc__)
+    parser.add_argument("--scenes", type=Path, required=True, help="folder in HM3DSem layout; all its scenes are used")
+    parser.add_argument("--views", type=int, default=40, help="of each scene")
+    parser.add_argument("--seed", type=int, default=0, help="of the poses")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write counts of every scene there")
+    options = parser.parse_args()
+    found = find_scenes(options.scenes)
+    by_name = {folder.name: folder for folders in found.values() for folder in folders}
+    folders = [by_name[name] for name in sorted(by_name)]
+    torch.manual_seed(0)
+    counts, broken = evaluate_homes(folders, options.views, options.seed)
+    names = [folder.name for folder in folders if folder.name not in broken]
+    print(f"{len(names)} homes, {options.views} views each; IoU in percent [90 % interval over homes]")
+    print(results_table(counts).to_string())
+    if options.json:
+        rows = {
+            row: {
+                "class_iou": one.class_iou(),
+                "pixel_iou": one.pixel_iou(),
+                "weights": run_of(shipped(row)) if row in ROWS else None,
+                **one.to_json(),
+            }
+            for row, one in counts.items()
+        }
+        write_json(options.json, {"scenes": names, "views": options.views, "seed": options.seed, "rows": rows})
+    if broken:
+        sys.exit("\n".join(f"skipped {name}: {message}" for name, message in broken.items()))

@@ -1,0 +1,133 @@
+"""Modalities that no network was trained on, against their truth from the G-buffer (paper, Section 4).
+
+Semantic classes are what the paper's tables measure. Anything else that is known of surfaces can be projected, too, and
+its true map is known wherever both sensors know the surface: objects one by one, their outlines, labels without any
+meaning, and what a robot could do where.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from skimage.segmentation import find_boundaries
+
+from zerobev.config import LABELS, NO_LABEL, CameraConfig, TextureConfig
+from zerobev.evaluation.evaluate import evaluate
+from zerobev.evaluation.metrics import Counts, bootstrap_interval, iou_per_class
+from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.common.progress import progress
+from zerobev.experiments.records import kept
+from zerobev.scenes.hm3dsem import read_scene
+from zerobev.scenes.homes import ensure_homes
+from zerobev.geometry.projection import map_points
+from zerobev.data.samples import Pair, collate, view_sample
+from zerobev.data.views import View, ViewSource
+from zerobev.inference.shipped_weights import ROWS, shipped_runs
+from zerobev.experiments.workspace import Workspace
+
+#: name -> what is white
+MODALITIES = {
+    "instances": "objects of the six classes that stand in rooms, a mask each",
+    "outlines": "edges of objects, where a neighbouring pixel or cell belongs to another one",
+    "random labels": "blocks of surface, half a metre wide, with one of four labels that mean nothing",
+    "to sit on": "chairs, sofas, beds and toilets together",
+    "to put things on": "surfaces 0.4 to 1.1 m above the floor that are no wall",
+}
+_VIEWS = 10  # of each home
+_LEAST_PX = 20  # an instance with fewer pixels is no mask
+_BLOCK = 50  # texels of a random label, 1 cm each
+_LABELS = 4
+_SURFACE_M = (0.4, 1.1)
+_STRUCTURE = ("wall", "floor")
+_SEATS = ("chair", "sofa", "bed", "toilet")
+
+
+def unseen_masks(
+    view: View, instance_label: np.ndarray, camera: CameraConfig, rng: np.random.Generator
+) -> dict[str, Pair]:
+    """Every modality of a view: (K, H, H) and (K, M, M) bool, K of its own; `rng` draws the random labels."""
+    labels = instance_label[view.fpv_instance], instance_label[view.bev_instance]
+    ids, pixels = np.unique(view.fpv_instance, return_counts=True)
+    structure = [LABELS.index(name) for name in _STRUCTURE]
+    standing = (pixels >= _LEAST_PX) & ~np.isin(instance_label[ids], [NO_LABEL, *structure])
+    table = rng.integers(_LABELS, size=(61, 61, 61))  # repeats after 61 blocks
+    heights = map_points(torch.from_numpy(view.depth), camera)[..., 2].numpy(), view.bev_height
+    nothing = view.fpv_texel[..., 0] < 0, view.bev_texel[..., 0] < 0
+    images = []
+    for instance, texel, label, height, empty in zip(
+        (view.fpv_instance, view.bev_instance), (view.fpv_texel, view.bev_texel), labels, heights, nothing
+    ):
+        block = table[texel[..., 0] % 61, texel[..., 1] // _BLOCK % 61, texel[..., 2] // _BLOCK % 61]
+        furniture = ~np.isin(label, structure) & ~empty
+        images.append(
+            {
+                "instances": instance == ids[standing][:, None, None],
+                "outlines": (find_boundaries(instance, mode="inner") & furniture)[None],
+                "random labels": (block == np.arange(_LABELS)[:, None, None]) & ~empty,
+                "to sit on": np.isin(label, [LABELS.index(name) for name in _SEATS])[None],
+                "to put things on": (furniture & (height > _SURFACE_M[0]) & (height < _SURFACE_M[1]))[None],
+            }
+        )
+    return {name: (images[0][name], images[1][name]) for name in MODALITIES}
+
+
+def evaluate_unseen(folders: Iterable[Path], views: int = _VIEWS) -> dict[str, Counts]:
+    """Intersections and unions of the projection (a.2) and the shipped networks, a column a modality.
+
+    folders: of scenes in HM3DSem layout, each of which is rendered at `views` fresh poses
+    Raises `InputError` for a scene that cannot be read.
+    """
+    folders = list(folders)
+    projectors = {row: load(row) for row in (GEOMETRIC, *ROWS)}
+    camera = projectors[GEOMETRIC].camera
+    total = {row: Counts.empty(len(folders), len(MODALITIES)) for row in projectors}
+    for number, folder in enumerate(progress(folders, "homes", "home", len(folders))):
+        scene = read_scene(folder)
+        rng = np.random.default_rng([0, number])
+        source = ViewSource(scene, camera, TextureConfig(), rng)
+        for _ in range(views):
+            view = source.draw()
+            masks = unseen_masks(view, scene.instance_label, camera, rng)
+            zero, target = (np.concatenate(images) for images in zip(*masks.values()))
+            batch = collate([view_sample(view, camera, number, zero, target)])
+            ends = np.cumsum([len(images) for images, _ in masks.values()])[:-1]
+            for row, projector in projectors.items():
+                counts = evaluate(projector.predict, [batch], len(folders), len(zero))
+                total[row] += Counts(*(_summed(cells, ends) for cells in (counts.intersection, counts.union)))
+    return total
+
+
+def _summed(cells: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Counts (S, K) of masks -> (S, modalities): of each, its own masks together, which may be none."""
+    return np.stack([mine.sum(axis=1) for mine in np.split(cells, ends, axis=1)], axis=1)
+
+
+def unseen_table(counts: Mapping[str, Counts]) -> pd.DataFrame:
+    """IoU in percent with its 90 % interval over homes: a line a modality, a column a row."""
+    cells = {}
+    for row, one in counts.items():
+        low, high = bootstrap_interval([one], iou_per_class, np.random.default_rng(0))
+        cells[f"({row})"] = [
+            f"{100 * value:.1f} [{100 * a:.1f}, {100 * b:.1f}]" for value, a, b in zip(one.iou_per_class(), low, high)
+        ]
+    return pd.DataFrame(cells, index=pd.Index(MODALITIES, name="modality"))
+
+
+def recorded_unseen(workspace: Workspace) -> dict[str, Counts]:
+    """`evaluate_unseen` of a workspace's generated test homes: read where it is recorded, else computed.
+
+    The record `unseen.json` of the report names the weights that it is of; those of other weights are computed again.
+    """
+    homes = list(workspace.split.test)
+
+    def compute() -> dict[str, Any]:
+        ensure_homes(homes, workspace.scale.scenes.seed, 1)
+        return {row: counts.to_json() for row, counts in evaluate_unseen(homes).items()}
+
+    identity = {"weights": shipped_runs(), "views": _VIEWS, "scenes": asdict(workspace.scale.scenes)}
+    found = kept(workspace.reports / "unseen.json", identity, compute)
+    return {row: Counts.from_json(counts) for row, counts in found.items()}

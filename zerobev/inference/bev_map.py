@@ -1,0 +1,152 @@
+"""What comes back from a projection: maps, and arrows between maps, with metres attached."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.patches import Patch
+
+from zerobev.config import CameraConfig
+from zerobev.common.storage import replacing
+
+_FLOOR, _OUTSIDE = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
+_LONGEST_LEGEND = 12
+_COLORS = [color for name in ("tab10", "Set2", "Set1") for color in matplotlib.color_sequences[name]]
+
+
+@dataclass(frozen=True, eq=False)
+class BevMap:
+    """K maps of M x M cells: row 0 farthest, column 0 leftmost, the camera at the middle of the lower edge."""
+
+    values: np.ndarray  #: (K, M, M) float32 in [0, 1]: probability that a cell is white, or the projected real value
+    labels: tuple[str, ...]  #: K names
+    #: (K, M, M) float32 >= 0: what the modality adds to a map, as the rise of the logit over that of an empty image
+    evidence: np.ndarray
+    fov: np.ndarray  #: (M, M) bool: cells in the field of view, by estimated depth
+    camera: CameraConfig
+    scores: np.ndarray | None = None  #: (K,) float64, of detections
+
+    @property
+    def maps(self) -> np.ndarray:
+        """(K, M, M) bool: cells in the field of view with a value above one half."""
+        return (self.values > 0.5) & self.fov
+
+    @property
+    def cell_m(self) -> float:
+        """Side of a cell, metres."""
+        return self.camera.cell_m
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """`extent` for `imshow`: metres to the right of the camera, and in front of it."""
+        return self.camera.extent
+
+    @property
+    def centres_m(self) -> np.ndarray:
+        """(K, 2) float64: where each modality is, metres right and forward; NaN where nothing speaks for any cell.
+
+        It is the centre of gravity of the evidence of cells that have half of the most, or more. That finds what is too
+        small for a probability above one half anywhere.
+        """
+        row, column = np.indices(self.fov.shape) + 0.5
+        right, forward = column * self.cell_m + self.extent[0], self.extent[3] - row * self.cell_m
+        evidence = self.evidence.astype(np.float64) * self.fov
+        evidence *= evidence >= evidence.max(axis=(1, 2), keepdims=True) / 2
+        total = evidence.sum(axis=(1, 2))[:, None]
+        sums = np.stack([(evidence * axis).sum(axis=(1, 2)) for axis in (right, forward)], axis=1)
+        return np.divide(sums, total, out=np.full(sums.shape, np.nan), where=total > 0)
+
+    def footprints(self) -> pd.DataFrame:
+        """One line a map: label, score if there is one, area of `maps` in square metres, and centre in metres."""
+        score = {} if self.scores is None else {"score": self.scores}
+        right, forward = self.centres_m.T
+        area = self.maps.sum(axis=(1, 2)) * self.cell_m**2
+        return pd.DataFrame({"label": self.labels, **score, "area_m2": area, "right_m": right, "forward_m": forward})
+
+    def image(self) -> np.ndarray:
+        """(M, M, 3) float64: each map in a colour of its own, larger ones below smaller ones."""
+        image = np.where(self.fov[..., None], _FLOOR, _OUTSIDE)
+        for k in np.argsort(-self.maps.sum(axis=(1, 2)), kind="stable").tolist():
+            opacity = (self.values[k] * self.fov * (self.values[k] > 0.1))[..., None]
+            image = (1 - opacity) * image + opacity * np.array(color_of(k))
+        return image
+
+    def show(self, axes: Axes | None = None) -> Axes:
+        """Draw the maps with metres on both axes, and a legend of those that are not empty.
+
+        Detections are all shown: a cross marks the centre of those with an empty map.
+        """
+        axes = axes or plt.gca()
+        axes.imshow(self.image(), extent=self.extent, interpolation="nearest")
+        axes.set(xlabel="right [m]", ylabel="forward [m]")
+        found = self.maps.any(axis=(1, 2))
+        if self.scores is not None:
+            for k in np.flatnonzero(~found).tolist():
+                axes.plot(*self.centres_m[k], "x", color=color_of(k))
+            found |= np.isfinite(self.centres_m).all(axis=1)
+        shown = np.flatnonzero(found).tolist()
+        if 0 < len(shown) <= _LONGEST_LEGEND:
+            patches = [Patch(color=color_of(k), label=self._title(k)) for k in shown]
+            axes.legend(handles=patches, fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
+        return axes
+
+    def save(self, path: Path) -> None:
+        """Write one NPZ file: values, maps, fov, labels, extent (metres), cell_m, and scores if there are any."""
+        scores = {} if self.scores is None else {"scores": self.scores}
+        with replacing(path) as temporary:
+            np.savez_compressed(
+                temporary,
+                values=self.values,
+                maps=self.maps,
+                fov=self.fov,
+                labels=np.array(self.labels),
+                extent=self.extent,
+                cell_m=self.cell_m,
+                **scores,  # type: ignore[arg-type]  # NumPy's stub takes all for `allow_pickle`
+            )
+
+    def _title(self, k: int) -> str:
+        return self.labels[k] if self.scores is None else f"{self.labels[k]} {self.scores[k]:.2f}"
+
+
+@dataclass(frozen=True, eq=False)
+class BevArrows:
+    """N flow vectors on the map: each from the centre of its start's map to that of its end's."""
+
+    starts: BevMap
+    ends: BevMap
+
+    @property
+    def start_m(self) -> np.ndarray:
+        """(N, 2) float64, metres right and forward; NaN where it reaches no cell."""
+        return self.starts.centres_m
+
+    @property
+    def end_m(self) -> np.ndarray:
+        """(N, 2) float64, metres right and forward; NaN where it reaches no cell."""
+        return self.ends.centres_m
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """`extent` for `imshow`, metres."""
+        return self.starts.extent
+
+    def show(self, axes: Axes | None = None, color: str = "tab:red") -> Axes:
+        """Draw the arrows over the field of view, with metres on both axes."""
+        axes = axes or plt.gca()
+        field = np.where(self.starts.fov[..., None], _FLOOR, _OUTSIDE)
+        axes.imshow(field, extent=self.extent, interpolation="nearest")
+        start, vector = self.start_m, self.end_m - self.start_m
+        axes.quiver(*start.T, *vector.T, color=color, angles="xy", scale_units="xy", scale=1, width=0.006)
+        axes.set(xlabel="right [m]", ylabel="forward [m]")
+        return axes
+
+
+def color_of(k: int) -> tuple[float, float, float]:
+    """The colour of map number k; colours repeat after some dozens."""
+    return to_rgb(_COLORS[k % len(_COLORS)])

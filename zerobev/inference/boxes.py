@@ -1,0 +1,124 @@
+"""Detected objects as filled boxes (paper, Section 4, "Additional zero-shot capabilities" figure of objects)."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import pandas as pd
+from skimage.measure import regionprops
+
+from zerobev.common.errors import InputError
+from zerobev.inference.images import BinaryImages
+
+_SIDES = ("xmin", "ymin", "xmax", "ymax")
+_LEAST_PX = 12  # an instance of fewer pixels is found by no detector
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """N detections in one photograph.
+
+    Raises `InputError` for arrays that do not fit each other, for corners that are not finite or in the wrong order,
+    and for scores outside [0, 1].
+    """
+
+    corners: np.ndarray  #: (N, 4) float64: left, top, right, bottom, in pixels from the image's upper left corner
+    labels: tuple[str, ...]
+    scores: np.ndarray  #: (N,) float64 in [0, 1]
+    source: str = "given"  #: what found them, in words
+
+    def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "corners", np.asarray(self.corners, np.float64))
+            object.__setattr__(self, "scores", np.asarray(self.scores, np.float64))
+            object.__setattr__(self, "labels", tuple(map(str, self.labels)))
+        except (ValueError, TypeError, OverflowError) as error:
+            raise InputError(f"boxes: expected numbers as corners and scores, and labels, found {error}") from None
+        count = len(self.labels)
+        if np.shape(self.corners) != (count, 4) or np.shape(self.scores) != (count,):
+            found = f"{np.shape(self.corners)} and {np.shape(self.scores)}"
+            raise InputError(f"boxes: expected corners ({count}, 4) and scores ({count},), found {found}")
+        for number, (left, top, right, bottom) in enumerate(self.corners):
+            if not (np.isfinite([left, top, right, bottom]).all() and left < right and top < bottom):
+                found = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
+                raise InputError(f"boxes: expected xmin < xmax and ymin < ymax in box {number}, found {found}")
+        if not all(0 <= score <= 1 for score in self.scores):
+            raise InputError(f"boxes: expected scores in [0, 1], found {np.min(self.scores)} to {np.max(self.scores)}")
+
+    @classmethod
+    def from_table(cls, table: pd.DataFrame, source: str = "given") -> Self:
+        """The rows of a table with columns xmin, ymin, xmax, ymax (pixels), label, and perhaps score (else 1)."""
+        missing = [name for name in (*_SIDES, "label") if name not in table]
+        if missing:
+            found = ", ".join(map(str, table.columns))
+            raise InputError(f"{source}: expected columns {', '.join(_SIDES)}, label, found {found}")
+        try:
+            corners = table[list(_SIDES)].to_numpy(np.float64)
+            scores = table["score"].to_numpy(np.float64) if "score" in table else np.ones(len(table))
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{source}: expected numbers as corners and scores, found: {error}") from None
+        return cls(corners, tuple(map(str, table["label"])), scores, source)
+
+    @classmethod
+    def read_csv(cls, path: Path) -> Self:
+        """As `from_table`, from a CSV file with a header."""
+        try:
+            table = pd.read_csv(path)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: expected a CSV table of boxes, found: {error}") from None
+        return cls.from_table(table, str(path))
+
+    def images(self, shape: tuple[int, int]) -> BinaryImages:
+        """Each box as a filled mask of a photograph of `shape` (H, W); no box at all is an `InputError`."""
+        if not self.labels:
+            raise InputError("modality: expected at least one box, found none")
+        return BinaryImages(self.labels, self._filled(shape), scores=np.asarray(self.scores, np.float64))
+
+    def _filled(self, shape: tuple[int, int]) -> Iterator[np.ndarray]:
+        for corners in self.corners:
+            sides = np.floor(np.clip(corners, -1, max(shape) + 1) + 0.5).astype(int)
+            left, top = sides[:2]  # pixels with their centre inside, and one at least
+            right, bottom = np.maximum(sides[2:], (left + 1, top + 1))
+            image = np.zeros(shape, bool)
+            image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = True
+            yield image
+
+
+def rendered_boxes(
+    instance: np.ndarray,
+    names: Mapping[int, str],
+    rng: np.random.Generator,
+    jitter: float = 0.05,
+    misses: float = 0.1,
+) -> Boxes:
+    """Boxes of rendered instances, spoilt a little: they stand in for a detector where there is none, and say so.
+
+    instance: (H, W) integers, the instance that each pixel sees
+    names: instance id -> label, of the instances that count as objects
+    jitter: standard deviation of each side, as a share of the box's width or height
+    misses: share of the objects that are not found
+    The score of a box is its overlap (IoU) with the true one.
+    """
+    found: list[tuple[np.ndarray, str, float]] = []
+    for region in regionprops(np.asarray(instance).astype(np.int64)):
+        if region.label not in names or region.area < _LEAST_PX:
+            continue
+        missed, shifts = rng.random() < misses, rng.normal(0, jitter, 4)
+        top, left, bottom, right = region.bbox
+        true = np.array([left, top, right, bottom], np.float64)
+        size = np.array([right - left, bottom - top] * 2)
+        limits = np.array([instance.shape[1], instance.shape[0]] * 2)
+        spoilt = np.clip(true + shifts * size, 0, limits)
+        if not missed and (spoilt[2:] - spoilt[:2] >= 1).all():
+            found.append((spoilt, names[region.label], _overlap(true, spoilt)))
+    corners = np.array([corners for corners, _, _ in found]).reshape(-1, 4)
+    scores = np.array([score for _, _, score in found], np.float64)
+    return Boxes(corners, tuple(label for _, label, _ in found), scores, "rendered instances, jittered, some missed")
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two boxes (left, top, right, bottom)."""
+    inside = np.prod(np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0, None))
+    return float(inside / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - inside))

@@ -1,0 +1,117 @@
+"""Where an agent can stand in a scene, and poses drawn uniformly from there (paper, Section 4)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from scipy import ndimage
+
+from zerobev.config import LABELS, AgentConfig
+from zerobev.common.errors import InputError
+from zerobev.scenes.scene import Scene
+from zerobev.geometry.cameras import Pose
+
+_SAMPLES_PER_M2 = 2000  # surface samples that find obstacles: five for each 5 cm cell of a horizontal surface
+_LEVEL = 0.9  # a floor face's normal points up at least this much
+
+
+@dataclass(frozen=True)
+class NavigableFloor:
+    """Free floor of a scene: centres of the cells where the agent's axis may stand."""
+
+    cells: np.ndarray  #: (N, 3) float64, metres, world
+    grid_m: float
+
+    @property
+    def area_m2(self) -> float:
+        """Navigable area."""
+        return len(self.cells) * self.grid_m**2
+
+    def draw(self, rng: np.random.Generator) -> Pose:
+        """A pose with position uniform over the free floor and uniform heading."""
+        x, y, z = self.cells[rng.integers(len(self.cells))]
+        dx, dy = rng.uniform(-self.grid_m / 2, self.grid_m / 2, 2)
+        return Pose(float(x + dx), float(y + dy), float(z), float(rng.uniform(-np.pi, np.pi)))
+
+
+def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) -> NavigableFloor:
+    """Rasterise the floor, take away what the agent's body would meet, and keep patches of a useful size.
+
+    Several storeys are handled one above the other. Raises `InputError` where no free floor is left.
+    """
+    corner = scene.vertices[scene.faces].astype(np.float64)
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    up = np.abs(normal[:, 2]) > _LEVEL * np.linalg.norm(normal, axis=1)
+    floor = up & (scene.instance_label[scene.face_instance] == LABELS.index("floor"))
+    if not floor.any():
+        raise InputError(f"scene {scene.name}: expected a horizontal face of class floor, found none")
+    low = corner[floor].min(axis=(0, 1))[:2]
+    shape = tuple(np.ceil((corner[floor].max(axis=(0, 1))[:2] - low) / agent.grid_m).astype(int) + 1)
+    lowest, highest = corner[floor][..., 2].min() + agent.climb_m, corner[floor][..., 2].max() + agent.height_m
+    in_the_way = ~floor & (corner[..., 2].max(axis=1) > lowest) & (corner[..., 2].min(axis=1) < highest)
+    x, y, z = _surface_samples(corner[in_the_way], rng)
+    i, j = (((axis - start) / agent.grid_m).astype(np.float32) for axis, start in zip((x, y), low))
+    inside = np.flatnonzero((i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]))
+    obstacle_m = z.take(inside)
+    obstacle_cell = i.take(inside).astype(np.intp) * shape[1] + j.take(inside).astype(np.intp)
+
+    cells = []
+    for height in _storeys(scene, floor, low, shape, agent):
+        above = obstacle_m - height.ravel().take(obstacle_cell)
+        free = np.isfinite(height)
+        free.ravel()[obstacle_cell[(above > agent.climb_m) & (above < agent.height_m)]] = False
+        # the axis keeps the radius from everything that is not free, the border of the grid included
+        room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * agent.grid_m > agent.radius_m
+        patch, count = ndimage.label(room)
+        area = ndimage.sum_labels(room, patch, np.arange(count + 1)) * agent.grid_m**2
+        i, j = np.nonzero(room & (area[patch] >= agent.island_m2))
+        cells.append(np.stack([*(low[:, None] + (np.stack([i, j]) + 0.5) * agent.grid_m), height[i, j]], axis=1))
+    found = np.concatenate(cells)
+    if not len(found):
+        raise InputError(f"scene {scene.name}: expected at least {agent.island_m2} m2 of free floor, found none")
+    return NavigableFloor(found, agent.grid_m)
+
+
+def _surface_samples(corner: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """x, y and z, float32, of points drawn uniformly on each of the triangles `corner` (F, 3, 3)."""
+    edge = corner[:, 1:] - corner[:, :1]
+    area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
+    face = np.repeat(np.arange(len(corner)), np.ceil(area * _SAMPLES_PER_M2).astype(int))
+    a, b = rng.random((2, len(face)), np.float32)
+    beyond = a + b > 1  # the other half of the parallelogram is turned back onto the triangle
+    a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
+    sides = np.stack([corner[:, 0], edge[:, 0], edge[:, 1]]).astype(np.float32)
+    start, first, second = (side.T for side in sides)
+    return tuple(start[k].take(face) + a * first[k].take(face) + b * second[k].take(face) for k in range(3))
+
+
+def _storeys(
+    scene: Scene, floor: np.ndarray, low: np.ndarray, shape: tuple[int, int], agent: AgentConfig
+) -> list[np.ndarray]:
+    """Floor height of each grid cell, one (I, J) array a storey from the lowest up; NaN where there is no floor.
+
+    Floors of one storey are no step higher than `climb_m` apart, so that a gallery ends at its edge.
+    """
+    embree = EmbreeScene()
+    mesh = TriangleMesh(embree, scene.vertices.astype(np.float32), scene.faces[floor].astype(np.int32))
+    i, j = np.indices(shape)
+    start = np.full(shape, scene.vertices[:, 2].max() + 1.0)
+    layers = []  # from the top down; one layer may be upper floor here and lower floor there
+    while True:
+        origins = np.stack([low[0] + (i + 0.5) * agent.grid_m, low[1] + (j + 0.5) * agent.grid_m, start], axis=-1)
+        origins = np.ascontiguousarray(origins.reshape(-1, 3), np.float32)
+        down = np.broadcast_to(np.array([0, 0, -1], np.float32), origins.shape)
+        found = embree.run(origins, np.ascontiguousarray(down), query="INTERSECT", output=True)
+        hit = found["primID"].reshape(shape) >= 0
+        height = np.where(hit, start - found["tfar"].reshape(shape), np.nan)
+        layers.append(height)
+        if not hit.any():
+            break
+        # what lies within the agent's height below is the same storey (the floor under a rug)
+        start = np.where(hit, height - agent.height_m, -1e6)
+    del mesh  # Embree points into its arrays until here
+    heights = np.sort(np.concatenate([height[np.isfinite(height)] for height in layers]))
+    lowest = heights[1:][np.diff(heights) > agent.climb_m]  # of each storey but the first
+    storey = np.searchsorted(lowest, layers, side="right")
+    return [np.fmax.reduce(np.where(storey == k, layers, np.nan)) for k in range(len(lowest) + 1)]

@@ -1,0 +1,120 @@
+"""The paper's claims held against our records: holds, does not hold, or undecided - computed, never typed.
+
+What is judged is the order of rows, the sign of a gain, the spread of several rows; not absolute numbers, since the
+scenes differ. A verdict stands on means over seeds with a 90 % bootstrap interval over test scenes and seeds.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from zerobev.config import LABELS
+from zerobev.common.errors import InputError
+from zerobev.evaluation.metrics import Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
+from zerobev.report.paper import TABLES, Ordering, Ratio, Row, Similar
+from zerobev.experiments.records import Record
+
+_DRAWS = 1000
+_LEVEL = 0.9
+_OBJECTS = [LABELS.index(name) for name in LABELS if name not in ("wall", "floor")]
+
+#: From the statistic of every row that a claim names, (..., rows), to the number that is judged, (...).
+Measure = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim of the paper, held against our records."""
+
+    id: str
+    table: int
+    claim: str
+    paper: float | None  #: IoU points; None where the paper has no such row
+    ours: float | None
+    low: float | None  #: 90 % interval over test scenes and seeds
+    high: float | None
+    verdict: str  #: "holds", "does not hold", "undecided", or "not run"
+
+
+def judge(claim: Ordering | Similar, records: Sequence[Record]) -> Verdict:
+    """Whether a claim of the paper holds here too, or one of `zerobev.report.own_rows` at all.
+
+    An ordering holds where the interval of the paired gain lies above zero, and does not where it lies below. Rows
+    are similar where the interval of their spread lies below the claim's `points`, and are not where it lies above.
+    Records of other rows are left aside; those of the claim's rows must be of the same test scenes, else it is an
+    `InputError`.
+    """
+    rows, measure = _measured(claim)
+    published = TABLES.get(claim.table, {})
+    paper = None
+    if set(rows) <= set(published):
+        paper = round(float(measure(np.array([_published(published[row], claim.metric) for row in rows]))), 1)
+    text = f"{_named(claim)}: {claim.text}"
+    found = _measure(rows, claim.metric, measure, records)
+    if found is None:
+        return Verdict(claim.id, claim.table, text, paper, None, None, None, "not run")
+    ours, low, high = (round(100 * value, 1) for value in found)
+    # judged on what is not rounded
+    lowest, highest = 100 * found[1], 100 * found[2]
+    if isinstance(claim, Ordering):
+        verdict = "holds" if lowest > 0 else "does not hold" if highest < 0 else "undecided"
+    else:
+        verdict = "holds" if highest < claim.points else "does not hold" if lowest > claim.points else "undecided"
+    return Verdict(claim.id, claim.table, text, paper, ours, low, high, verdict)
+
+
+def compare(ratio: Ratio, records: Sequence[Record]) -> dict[str, str | float | None]:
+    """A quotient of two rows in the paper and here, with our 90 % interval; None where a row was not run."""
+    rows = (ratio.numerator, ratio.denominator)
+    published = [_published(TABLES[1][row], ratio.metric) for row in rows]
+    found = _measure(rows, ratio.metric, lambda values: values[..., 0] / values[..., 1], records)
+    ours, low, high = (None, None, None) if found is None else (round(value, 3) for value in found)
+    return {**asdict(ratio), "paper": round(published[0] / published[1], 3), "ours": ours, "low": low, "high": high}
+
+
+def _measured(claim: Ordering | Similar) -> tuple[tuple[str, ...], Measure]:
+    """The rows that a claim is about, and what is measured of them."""
+    if isinstance(claim, Ordering):
+        return (claim.better, claim.worse), lambda values: values[..., 0] - values[..., 1]
+    return claim.rows, lambda values: values.max(axis=-1) - values.min(axis=-1)
+
+
+def _named(claim: Ordering | Similar) -> str:
+    if isinstance(claim, Ordering):
+        return f"({claim.better}) > ({claim.worse}), {claim.metric} IoU"
+    return f"{', '.join(f'({row})' for row in claim.rows)} within {claim.points} points, {claim.metric} IoU"
+
+
+def _measure(
+    rows: Sequence[str], metric: str, measure: Measure, records: Sequence[Record]
+) -> tuple[float, float, float] | None:
+    """The measured value and its interval; None where a row has no record."""
+    runs = {row: [record for record in records if record.row == row] for row in rows}
+    if not all(runs.values()):
+        return None
+    if len({tuple(run.scenes) for found in runs.values() for run in found}) > 1:
+        raise InputError(f"records of {' and '.join(rows)}: expected runs on the same test scenes, found others")
+    statistic = _statistic(metric)
+    counts = [[run.counts for run in runs[row]] for row in rows]
+    whole = measure(np.array([np.mean([one.value(statistic) for one in seeds]) for seeds in counts]))
+    draws = measure(np.stack(resampled_scenes(counts, statistic, np.random.default_rng(0), _DRAWS), axis=-1))
+    low, high = np.nanquantile(draws, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+    return float(whole), float(low), float(high)
+
+
+def _published(row: Row, metric: str) -> float:
+    if metric in LABELS:
+        return row.per_class[LABELS.index(metric)]
+    if metric == "objects":
+        return float(np.mean([row.per_class[i] for i in _OBJECTS]))
+    return row.class_iou if metric == "class" else row.pixel_iou
+
+
+def _statistic(metric: str) -> Statistic:
+    if metric in LABELS:
+        column = LABELS.index(metric)
+        return lambda intersection, union: iou_per_class(intersection, union)[..., column]
+    if metric == "objects":
+        return lambda intersection, union: class_iou(intersection[..., _OBJECTS], union[..., _OBJECTS])
+    return {"class": class_iou, "pixel": pixel_iou}[metric]

@@ -1,0 +1,291 @@
+"""The whole workbook in one command: `python -m zerobev.report.notebooks --scale reduced` (`make reproduce`).
+
+Every notebook is executed in order with the scale and the scenes as its parameters, and kept, executed and as
+HTML, in `reports/<report>/notebooks/`. What a kernel says beside its outputs goes to `reports/<report>/logs/`.
+A run that was stopped is started again: the notebooks read what is already recorded.
+"""
+
+import argparse
+import base64
+import contextlib
+import fcntl
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import nbformat
+import papermill
+from nbclient.exceptions import DeadKernelError
+from nbconvert import HTMLExporter
+from nbformat import NotebookNode
+from papermill.exceptions import PapermillExecutionError
+
+from zerobev import config
+from zerobev.common.errors import InputError, run_command
+from zerobev.common.storage import replacing
+
+ROOT = Path(__file__).resolve().parents[1]
+CACHE = ROOT / ".cache"
+
+
+class NotebookError(Exception):
+    """A notebook did not run through; the message names the notebook, the cell and the error."""
+
+
+def report_name(scale: str, scenes: Path | None) -> str:
+    """Name of the folder in `reports/`: the scale's, or `<scale>-<folder>-scenes` for scenes read from a folder."""
+    return scale if scenes is None else f"{scale}-{scenes.resolve().name}-scenes"
+
+
+def kernel_settings() -> dict[str, str]:
+    """Environment variables of every notebook kernel; the folders they name are made.
+
+    They name this environment's own kernel, let figures appear in the notebook, find the package from any folder,
+    and keep what Jupyter, IPython and matplotlib write inside the repository, so that neither the user's settings
+    nor a home that cannot be written change an output.
+    """
+    own = {
+        "JUPYTER_CONFIG_DIR": "jupyter/config",
+        "JUPYTER_DATA_DIR": "jupyter/data",
+        "JUPYTER_RUNTIME_DIR": "jupyter/runtime",
+        "IPYTHONDIR": "ipython",
+        "MPLCONFIGDIR": "matplotlib",
+    }
+    for folder in own.values():
+        (CACHE / folder).mkdir(parents=True, exist_ok=True)
+    return {
+        **{variable: str(CACHE / folder) for variable, folder in own.items()},
+        "JUPYTER_PATH": str(Path(sys.prefix) / "share" / "jupyter"),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "MPLBACKEND": "module://matplotlib_inline.backend_inline",
+        # a progress bar of Jupyter widgets is not wanted, so that it cannot be had is no news
+        "PYTHONWARNINGS": "ignore:IProgress not found",
+        "TOKENIZERS_PARALLELISM": os.environ.get("TOKENIZERS_PARALLELISM", "false"),
+    }
+
+
+@contextlib.contextmanager
+def environment(variables: dict[str, str]) -> Iterator[None]:
+    """Set environment variables, for kernels to inherit, and restore all of them at the end."""
+    before = dict(os.environ)
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+@contextlib.contextmanager
+def only_run(logs: Path) -> Iterator[None]:
+    """Hold the folder `logs` (made if missing) for this process; an `InputError` if another process holds it."""
+    logs.mkdir(parents=True, exist_ok=True)
+    with (logs / ".lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{logs}: expected no other run of this report, found one at work") from None
+        yield
+
+
+@contextlib.contextmanager
+def shown_progress(file: Path) -> Iterator[None]:
+    """Let kernels write the progress of long work to `file`, and pass it on to the terminal, if there is one."""
+    file.write_text("")
+    done = threading.Event()
+    terminal = os.dup(2)
+
+    def follow() -> None:
+        with file.open("rb") as written:
+            while not done.wait(0.5):
+                os.write(terminal, written.read())
+
+    follower = threading.Thread(target=follow, daemon=True)
+    with environment({"ZEROBEV_PROGRESS": str(file)}):
+        if sys.stderr.isatty():
+            follower.start()
+        try:
+            yield
+        finally:
+            done.set()
+            if follower.is_alive():
+                follower.join()
+            os.close(terminal)
+
+
+@contextlib.contextmanager
+def standard_error_in(log: Path) -> Iterator[None]:
+    """Let file descriptor 2, of this process and of the kernels it starts, write to the end of `log`."""
+    sys.stderr.flush()
+    terminal = os.dup(2)
+    with log.open("ab") as file:
+        os.dup2(file.fileno(), 2)
+    try:
+        yield
+    finally:
+        sys.stderr.flush()
+        os.dup2(terminal, 2)
+        os.close(terminal)
+
+
+def execute(notebook: Path, executed: Path, logs: Path, parameters: dict[str, str]) -> NotebookNode:
+    """Execute `notebook` with `parameters`, from the repository's root, and write it to `executed` when it ran through.
+
+    The output streams of its cells and the messages of its kernel go to `logs/<notebook>.log`, and on failure the
+    traceback too. Raises `NotebookError`; then `executed` is not touched.
+    """
+    logs.mkdir(parents=True, exist_ok=True)
+    log = logs / f"{notebook.stem}.log"
+    log.unlink(missing_ok=True)
+    with replacing(executed) as unfinished, log.open("a") as streams:
+        try:
+            with standard_error_in(log):
+                return papermill.execute_notebook(
+                    notebook,
+                    unfinished,
+                    parameters,
+                    kernel_name="python3",
+                    language="python",
+                    progress_bar=False,
+                    stdout_file=streams,
+                    stderr_file=streams,
+                    cwd=ROOT,
+                    coalesce_streams=True,
+                )
+        except PapermillExecutionError as error:
+            streams.write(str(error))
+            reason = f"{error.ename}: {(error.evalue.splitlines() or [''])[0]}"
+        except DeadKernelError:
+            reason = "the kernel died (see the log; out of memory?)"
+        raise NotebookError(f"{notebook.name}, {_stopped_at(unfinished)}: {reason}\n  log: {log}")
+
+
+def _stopped_at(unfinished: Path) -> str:
+    """Number, among the author's code cells, and first line of the last cell that was started."""
+    code = [cell for cell in nbformat.read(unfinished, as_version=4).cells if cell.cell_type == "code"]
+    code = [cell for cell in code if "injected-parameters" not in cell.metadata.get("tags", [])]
+    started = [cell for cell in code if cell.metadata.papermill.start_time]
+    if not started:
+        return "before its first code cell"
+    return f"code cell {len(started)} (`{started[-1].source.strip().splitlines()[0]}`)"
+
+
+def write_page(notebook: NotebookNode, page: Path, log: Path) -> None:
+    """Write an executed notebook as HTML; the converter's remarks go to `log`."""
+    with replacing(page) as unfinished, standard_error_in(log):
+        unfinished.write_text(HTMLExporter().from_notebook_node(notebook)[0], encoding="utf-8")
+
+
+def _notebooks_in(folder: Path) -> list[Path]:
+    found = sorted(folder.glob("*.ipynb"))
+    if not found:
+        raise InputError(f"{folder}: expected notebooks (*.ipynb), found none")
+    return found
+
+
+def _progress(notebooks: list[Path]) -> Iterator[Path]:
+    """Yield each notebook; print its name when it starts, the seconds it took when it is done, and the total."""
+    begin = time.monotonic()
+    for number, notebook in enumerate(notebooks, start=1):
+        start = time.monotonic()
+        print(f"[{number}/{len(notebooks)}] {notebook.stem} ...", end="", flush=True)
+        yield notebook
+        print(f" {time.monotonic() - start:.1f} s", flush=True)
+    print(f"total {time.monotonic() - begin:.1f} s")
+
+
+def reproduce(
+    scale: str,
+    scenes: Path | None = None,
+    textures: Path | None = None,
+    fresh: bool = False,
+    notebooks: Path = ROOT / "notebooks",
+    reports: Path = ROOT / "reports",
+) -> Path:
+    """Execute every notebook of the folder `notebooks`, in order of name, and return the report's folder.
+
+    scale: name of a scale, the notebooks' parameter `SCALE`.
+    scenes: folder of HM3DSem scenes, the parameter `SCENES` as an absolute path; None (`""`) is generated homes.
+    textures: folder of texture images; kernels find it in the environment variable `ZEROBEV_TEXTURES`.
+    fresh: compute again what is recorded; kernels find the time of this call, in seconds since 1970, in
+        `ZEROBEV_FRESH`, and take no record that is older.
+    Raises `InputError` before anything is executed, `NotebookError` at the first notebook that fails.
+    """
+    config.scale(scale)
+    for name, folder in (("scenes", scenes), ("textures", textures)):
+        if folder is not None and not folder.is_dir():
+            raise InputError(
+                f"{name}: expected a folder, found {'a file' if folder.exists() else 'nothing'} at {folder}"
+            )
+    sources = _notebooks_in(notebooks)
+    parameters = {"SCALE": scale, "SCENES": "" if scenes is None else str(scenes.resolve())}
+    variables = kernel_settings()
+    if textures is not None:
+        variables["ZEROBEV_TEXTURES"] = str(textures.resolve())
+    if fresh:
+        variables["ZEROBEV_FRESH"] = str(time.time())
+
+    report = reports / report_name(scale, scenes)
+    executed, logs = report / "notebooks", report / "logs"
+    with only_run(logs), environment(variables), shown_progress(logs / "progress.log"):
+        shutil.rmtree(executed, ignore_errors=True)  # copies of an earlier run would pass for this one's
+        for notebook in _progress(sources):
+            copy = execute(notebook, executed / notebook.name, logs, parameters)
+            write_page(copy, executed / f"{notebook.stem}.html", logs / f"{notebook.stem}.log")
+    return report
+
+
+def first_picture(notebook: NotebookNode) -> bytes | None:
+    """The first figure among a notebook's outputs, as PNG; None if it has none."""
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    pictures = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
+    return base64.b64decode(pictures[0]) if pictures else None
+
+
+def refresh(notebooks: Path = ROOT / "notebooks", reports: Path = ROOT / "reports") -> None:
+    """Execute every notebook of the folder again with its own parameters and put it, whole and clean, in its place.
+
+    Clean: no trace of when and by what a notebook was executed, so that equal outputs are equal files. The first
+    picture of the first notebook, the tour, is the README's: it goes to `reports/tour.png`.
+    """
+    cache = CACHE / "notebooks"
+    with only_run(cache), environment(kernel_settings()):
+        for notebook in _progress(_notebooks_in(notebooks)):
+            copy = execute(notebook, cache / notebook.name, cache, {})
+            copy.metadata = {"kernelspec": copy.metadata.kernelspec, "language_info": {"name": "python"}}
+            for cell in copy.cells:
+                cell.metadata = {"tags": cell.metadata.tags} if cell.metadata.get("tags") else {}
+            with replacing(notebook) as clean:
+                nbformat.write(copy, clean)
+    picture = first_picture(nbformat.read(_notebooks_in(notebooks)[0], as_version=4))
+    if picture:
+        with replacing(reports / "tour.png") as file:
+            file.write_bytes(picture)
+
+
+def main(**folders: Path) -> None:
+    """The command line; `folders` are `notebooks` and `reports` of `reproduce`."""
+    parser = argparse.ArgumentParser(prog="python -m zerobev.report.notebooks", description="Run the whole workbook.")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--scale", help=f"{', '.join(config.SCALES)}: run it at this scale into reports/")
+    what.add_argument("--in-place", action="store_true", help="execute the committed notebooks again, in place")
+    parser.add_argument("--scenes", type=Path, metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    parser.add_argument("--textures", type=Path, metavar="DIR", help="texture images for the zero-shot stream")
+    parser.add_argument("--fresh", action="store_true", help="compute again what is already recorded")
+    given = parser.parse_args()
+    try:
+        if given.in_place:
+            refresh(**folders)
+        else:
+            report = reproduce(given.scale, given.scenes, given.textures, given.fresh, **folders)
+            print(f"notebooks and their HTML: {report / 'notebooks'}")
+    except NotebookError as error:
+        sys.exit(f"\nerror: {error}")
+
+
+if __name__ == "__main__":
+    run_command(main)

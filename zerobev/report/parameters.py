@@ -1,0 +1,47 @@
+"""`python -m zerobev.models --scale paper`: the parameters of every network, block by block, beside the paper's."""
+
+import argparse
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from zerobev.config import SCALES, scale
+from zerobev.common.errors import run_command
+from zerobev.models.variants import VARIANTS, build
+from zerobev.report.paper import PARAMETERS_M
+from zerobev.common.storage import write_json
+
+BLOCKS = (
+    *("backbone", "zero_cnn", "pyramid", "bands", "view", "outs", "gates", "values", "embedding", "decoder"),
+    "total",
+)
+
+
+def parameters(network: nn.Module) -> dict[str, int]:
+    """Trainable parameters of each block of `network`, in the order of the pass, and their total."""
+    table = {name: sum(p.numel() for p in block.parameters()) for name, block in network.named_children()}
+    return {**table, "total": sum(table.values())}
+
+
+def main() -> None:
+    """Print the table; with `--json`, write the total of every row too."""
+    parser = argparse.ArgumentParser(prog="python -m zerobev.models", description=__doc__)
+    parser.add_argument("--scale", default="paper", help=f"one of {', '.join(SCALES)} (default: paper)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write {row: parameters} to FILE")
+    arguments = parser.parse_args()
+    chosen = scale(arguments.scale)
+    with torch.device("meta"):  # shapes without memory
+        tables = {row: parameters(build(row, chosen.camera, chosen.model)) for row in VARIANTS}
+    print(f"{'row':<5}{'network':<17}" + "".join(f"{block:>12}" for block in BLOCKS) + f"{'paper':>9}")
+    for row, table in tables.items():
+        counts = "".join(f"{table[block]:>12,}" if block in table else f"{'':>12}" for block in BLOCKS)
+        published = f"{PARAMETERS_M[row]:>7g} M" if row in PARAMETERS_M else ""
+        print(f"{row:<5}{VARIANTS[row][0].__name__:<17}{counts}{published}")
+    print("paper: Table 1, at scale paper; of (d) without the depth estimator")
+    if arguments.json:
+        write_json(arguments.json, {row: table["total"] for row, table in tables.items()})
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,125 @@
+"""Training, evaluation and use of depth estimators (paper, supplement, "Finetuning monocular depth estimation").
+
+The objective is the mean absolute difference in metres, for our own network from its first step as for fine-tuning.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from zerobev.config import TrainConfig
+from zerobev.training.history import History
+from zerobev.training.losses import Losses
+from zerobev.training.train import train
+from zerobev.models.depth import DepthEstimator
+from zerobev.data.samples import ViewOrder, ViewSet
+
+Batch = Mapping[str, Tensor]
+_BATCH = 32  # photographs that are estimated together
+
+
+class DepthTuples:
+    """Endless pairs of photograph and depth; half of them mirrored, since a mirrored home is a home.
+
+    Sample i is a function of (seed, i) alone. Each pass over the views is in a new random order.
+    """
+
+    def __init__(self, views: ViewSet, seed: int, batch: int) -> None:
+        self._views, self._seed, self._batch = views, seed, batch
+        self._order = ViewOrder(len(views), seed)
+
+    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
+        """`rgb` (B, 3, H, W) in [0, 1] and `depth` (B, 1, H, W) metres, of a training step."""
+        first = step * self._batch
+        return _collated([self.sample(i) for i in range(first + rank, first + self._batch, ranks)])
+
+    def sample(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pair number `index`: photograph (H, W, 3) uint8 and depth (H, W) float32, metres."""
+        rgb, depth = _pair(self._views, self._order[index])
+        mirrored = np.random.default_rng([self._seed, 1, index]).random() < 0.5
+        return (rgb[:, ::-1], depth[:, ::-1]) if mirrored else (rgb, depth)
+
+
+def depth_objective(model: nn.Module, batch: Batch) -> Losses:
+    """Mean absolute difference over the pixels whose depth is known (above 0), metres."""
+    valid = batch["depth"] > 0
+    error = (model(batch["rgb"]).float() - batch["depth"]).abs()
+    loss = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
+    return Losses(loss, loss)
+
+
+def train_depth(
+    model: nn.Module,
+    views: ViewSet,
+    validation: ViewSet,
+    config: TrainConfig,
+    folder: Path,
+    seed: int,
+    *,
+    key: str,
+    device: torch.device | str | None = None,
+) -> History:
+    """Train a `DepthEstimator` in place; it is left with the weights that validated best (see `training.train`).
+
+    validation: all its views, unmirrored, are the validation set; the score is their mean absolute error, metres
+    """
+    held_out = [_views_batch(validation, first) for first in range(0, len(validation), _BATCH)]
+    data = DepthTuples(views, seed, config.batch)
+    return train(model, data, held_out, config, folder, seed, key=key, objective=depth_objective, device=device)
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Means over all pixels whose depth is known."""
+
+    mad_m: float  #: mean absolute difference, metres
+    relative: float  #: mean of absolute difference over true depth
+
+
+def depth_errors(estimator: DepthEstimator, views: ViewSet, device: torch.device | str = "cpu") -> DepthErrors:
+    """The two errors that the paper states of its estimator, on `views`."""
+    absolute = relative = pixels = 0.0
+    for shard in views.shards:
+        (predicted,) = predict_depth(estimator, ViewSet([shard]), device)
+        for i, maps in enumerate(predicted):
+            depth = shard.view(i).depth
+            truth = depth[depth > 0].astype(np.float64)
+            error = np.abs(maps[depth > 0] - truth)
+            absolute, relative, pixels = absolute + error.sum(), relative + (error / truth).sum(), pixels + len(truth)
+    return DepthErrors(absolute / pixels, relative / pixels)
+
+
+@torch.inference_mode()
+def predict_depth(estimator: DepthEstimator, views: ViewSet, device: torch.device | str = "cpu") -> list[np.ndarray]:
+    """Estimated depth of all views: one (V, H, W) float16 array a shard, metres, as `ViewSet.with_depth` takes them.
+
+    The estimator is moved to `device` and put into evaluation mode, in float32.
+    """
+    estimator = estimator.to(device).eval()
+    maps = [
+        estimator(_views_batch(views, first)["rgb"].to(device))[:, 0].half().cpu().numpy()
+        for first in range(0, len(views), _BATCH)
+    ]
+    ends = np.cumsum([len(shard) for shard in views.shards])
+    return np.split(np.concatenate(maps), ends[:-1])
+
+
+def _views_batch(views: ViewSet, first: int) -> dict[str, Tensor]:
+    return _collated([_pair(views, i) for i in range(first, min(first + _BATCH, len(views)))])
+
+
+def _pair(views: ViewSet, index: int) -> tuple[np.ndarray, np.ndarray]:
+    view = views.locate(index)[1]
+    return view.rgb, view.depth
+
+
+def _collated(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Tensor]:
+    rgb, depth = (np.stack(images) for images in zip(*pairs))
+    return {
+        "rgb": torch.from_numpy(np.moveaxis(rgb, -1, 1).astype(np.float32) / 255),
+        "depth": torch.from_numpy(depth[:, None].astype(np.float32)),
+    }
