@@ -112,8 +112,7 @@ $(READY): environment.txt pyproject.toml
 	mv .venv/.unfinished $@
 
 define OPEN_EGL
-import zerobev.rendering
-import pyrender
+from zerobev.rendering.opengl import pyrender
 scene = pyrender.Scene()
 scene.add(pyrender.PerspectiveCamera(yfov=1.0))
 pyrender.OffscreenRenderer(8, 8).render(scene)

@@ -4,11 +4,11 @@ import pytest
 import torch
 from torch import nn
 
-from zerobev import benchmark
+from zerobev.benchmarks import run as benchmark
+from zerobev.benchmarks import training
 from zerobev.benchmarks.run import ROWS, measure_inference
-from zerobev.config import SCALES
-from zerobev.learning import benchmark as training
 from zerobev.benchmarks.training import Machine, blocks, flops, least_milliseconds, training_step, waiting_share
+from zerobev.config import SCALES
 from zerobev.models import build
 
 SMOKE = SCALES["smoke"]

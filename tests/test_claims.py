@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from records_for_tests import record
 
-from zerobev.report.claims import compare, judge
-from zerobev.config import LABELS
 from zerobev.common.errors import InputError
+from zerobev.config import LABELS
+from zerobev.report.claims import compare, judge
 from zerobev.report.paper import CLAIMS, RATIOS, TABLES, Ordering, Ratio, Similar
 
 CLAIM = Ordering("1.5", "class", "better", "d", "c")

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import ndimage, stats
 
-from zerobev.config import CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig
 from zerobev.evaluation.decorrelation import (
     Measure,
     class_of_cells,

@@ -17,14 +17,14 @@ from transformers import (
     DPTForDepthEstimation,
 )
 
-from zerobev.config import SCALES, TrainConfig
 from zerobev.common.errors import InputError
-from zerobev.training.depth import DepthErrors, DepthTuples, depth_errors, depth_objective, predict_depth, train_depth
-from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
-from zerobev.models.depth import FARTHEST_M, DepthNet, HubDepth
-from zerobev.models.backbone_weights import load_backbone
+from zerobev.config import SCALES, TrainConfig
 from zerobev.data.samples import ViewSet
 from zerobev.data.views import View
+from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
+from zerobev.models.backbone_weights import load_backbone
+from zerobev.models.depth import FARTHEST_M, DepthNet, HubDepth
+from zerobev.training.depth import DepthErrors, DepthTuples, depth_errors, depth_objective, predict_depth, train_depth
 
 SMOKE = SCALES["smoke"]
 

@@ -4,8 +4,8 @@ import torch
 from torch import nn
 
 from zerobev.config import SCALES
-from zerobev.report.diagram import Stage, draw_networks, stages
 from zerobev.models.variants import VARIANTS, build
+from zerobev.report.diagram import Stage, draw_networks, stages
 
 SMOKE = SCALES["smoke"]
 

@@ -24,24 +24,26 @@ from dask.distributed import KilledWorker, LocalCluster
 from scenes_for_tests import build, furnished
 from torch import nn
 
-from zerobev import runs
+from zerobev.common.parallel import cluster
 from zerobev.config import LABELS, SCALES, CameraConfig, SceneConfig, TextureConfig, TrainConfig
+from zerobev.data.generate import generate
+from zerobev.data.samples import semantic_batches
+from zerobev.evaluation.evaluate import evaluate, model_predictor
+from zerobev.experiments import runs
+from zerobev.experiments.depth_pretraining import DepthPretraining
+from zerobev.experiments.records import RecordStore
 from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.evaluation.evaluate import evaluate, model_inputs, model_predictor, place
-from zerobev.training.history import History
-from zerobev.training.losses import Losses, zero_bev_loss
-from zerobev.training.train import train
+from zerobev.experiments.runs import run_key
+from zerobev.experiments.workspace import Workspace
 from zerobev.models import ZeroBEV
 from zerobev.models import build as build_network
 from zerobev.models.base import BevModel
-from zerobev.common.parallel import cluster
-from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.experiments.records import RecordStore
-from zerobev.experiments.runs import run_key
 from zerobev.scenes.hm3dsem_writer import write_scene
-from zerobev.data.generate import generate
-from zerobev.data.samples import semantic_batches
-from zerobev.experiments.workspace import Workspace
+from zerobev.training.distributed import rank_and_world_size
+from zerobev.training.history import History
+from zerobev.training.loader import model_inputs
+from zerobev.training.losses import Losses, zero_bev_loss
+from zerobev.training.train import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SMOKE = SCALES["smoke"]
@@ -113,7 +115,9 @@ def main(folder: Path, how: str = "whole") -> None:
     "alone" is the training without the run: it takes a process of its own, since accelerate settles its precision once.
     """
     history = train_frozen(folder / "frozen", killed_at=3 if how == "killed" else None)
-    (folder / f"history{place()[0]}.json").write_text(json.dumps([vars(entry) for entry in history.entries]))
+    (folder / f"history{rank_and_world_size()[0]}.json").write_text(
+        json.dumps([vars(entry) for entry in history.entries])
+    )
     if how == "alone":
         return
     SCALES["tiny"] = TINY
@@ -128,7 +132,7 @@ def noted(write: Callable, notes: Path) -> Callable:
 
     def noting(own: Any, *arguments: Any) -> None:
         with notes.open("a") as file:
-            file.write(f"{type(own).__name__} {place()[0]}\n")
+            file.write(f"{type(own).__name__} {rank_and_world_size()[0]}\n")
         write(own, *arguments)
 
     return noting

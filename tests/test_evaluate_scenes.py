@@ -9,18 +9,18 @@ import pytest
 import torch
 from scenes_for_tests import REAL_HOMES, build, furnished
 
-from zerobev.config import LABELS, TextureConfig
 from zerobev.common.errors import InputError, run_command
+from zerobev.config import LABELS, TextureConfig
+from zerobev.data.generate import generate_shard
+from zerobev.data.samples import ViewSet, semantic_batches
+from zerobev.data.shards import Shard
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.evaluation.metrics import Counts
 from zerobev.evaluation.real_homes import METHODS, evaluate_homes, main
+from zerobev.geometry.projection import project
+from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 from zerobev.models import load_model
 from zerobev.scenes.hm3dsem_writer import write_scene
-from zerobev.data.generate import generate_shard
-from zerobev.geometry.projection import project
-from zerobev.data.shards import Shard
-from zerobev.data.samples import ViewSet, semantic_batches
-from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 
 
 @pytest.fixture(scope="module")

@@ -18,23 +18,23 @@ import torch
 from scenes_for_tests import box, build, furnished, room
 from torch import Tensor, nn
 
-from zerobev.config import SCALES, AgentConfig, CameraConfig, TextureConfig, TrainConfig
 from zerobev.common.errors import InputError
-from zerobev.training.losses import Losses
-from zerobev.evaluation.metrics import Counts
-from zerobev.training.train import train
-from zerobev.models import build as build_network
-from zerobev.experiments.records import Record, RecordStore
-from zerobev.report.notebooks import only_run
-from zerobev.scenes.hm3dsem import read_scene
-from zerobev.scenes.hm3dsem_writer import write_scene
-from zerobev.scenes.scene import Scene
-from zerobev.rendering.poses import navigable_floor
 from zerobev.common.storage import write_json
+from zerobev.config import SCALES, AgentConfig, CameraConfig, TextureConfig, TrainConfig
 from zerobev.data.generate import generate, verify
 from zerobev.data.shards import write_shard
 from zerobev.data.textures import TextureBank
 from zerobev.data.views import View, ViewSource
+from zerobev.evaluation.metrics import Counts
+from zerobev.experiments.records import Record, RecordStore
+from zerobev.models import build as build_network
+from zerobev.rendering.poses import navigable_floor
+from zerobev.report.notebooks import only_run
+from zerobev.scenes.hm3dsem import read_scene
+from zerobev.scenes.hm3dsem_writer import write_scene
+from zerobev.scenes.scene import Scene
+from zerobev.training.losses import Losses
+from zerobev.training.train import train
 
 CAMERA, TEXTURE = CameraConfig(fpv_px=16, bev_px=10), TextureConfig(tiles=2)
 NOISE = np.random.default_rng(0).random((2, 128, 128))

@@ -28,8 +28,8 @@ from scenes_for_tests import box, build, room
 import zerobev
 from zerobev.common.errors import InputError
 from zerobev.evaluation.metrics import Counts
-from zerobev.inference.projector import MOST_IMAGES
 from zerobev.experiments.records import Record, RecordStore
+from zerobev.inference.projector import MOST_IMAGES
 from zerobev.scenes.hm3dsem import FIRST_LINE, read_instances, read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 

@@ -14,14 +14,14 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from zerobev.config import AgentConfig, CameraConfig
-from zerobev.scenes.indoor import generate_home
-from zerobev.scenes.scene import Scene
-from zerobev.rendering import photograph
 from zerobev.geometry.cameras import Pose, bev_cell_centres, fpv_rays
+from zerobev.geometry.projection import map_points
+from zerobev.rendering import photograph
 from zerobev.rendering.gbuffer import GBuffer, RayCaster
 from zerobev.rendering.photograph import Photographer
 from zerobev.rendering.poses import navigable_floor
-from zerobev.geometry.projection import map_points
+from zerobev.scenes.indoor import generate_home
+from zerobev.scenes.scene import Scene
 
 CAMERA = CameraConfig(fpv_px=48, bev_px=50)
 POSES = (Pose(2.0, 0.5, 0, 1.0), Pose(4.4, 2.4, 0, -2.9), Pose(0.6, 3.5, 0, -0.7))

@@ -19,14 +19,14 @@ import trimesh
 from dask.distributed import LocalCluster
 from scenes_for_tests import build, furnished, room
 
-from zerobev.config import CameraConfig, TextureConfig, scale
 from zerobev.common.errors import InputError, run_command
-from zerobev.scenes.hm3dsem import read_scene
-from zerobev.scenes.hm3dsem_writer import write_scene
-from zerobev.streams import generate as generation
+from zerobev.config import CameraConfig, TextureConfig, scale
+from zerobev.data import generate as generation
 from zerobev.data.generate import generate, shard_path, verify
 from zerobev.data.shards import Shard, checksum
 from zerobev.data.views import ViewSource
+from zerobev.scenes.hm3dsem import read_scene
+from zerobev.scenes.hm3dsem_writer import write_scene
 
 CAMERA = CameraConfig(fpv_px=16, bev_px=10)
 TEXTURE = TextureConfig()

@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from zerobev.config import LABELS, NO_LABEL
 from zerobev.common.errors import InputError
+from zerobev.config import LABELS, NO_LABEL
 from zerobev.scenes.glb import placed_meshes, read_glb
 from zerobev.scenes.hm3dsem import FIRST_LINE, read_instances, read_scene, split_scenes
 from zerobev.scenes.hm3dsem_writer import srgb_to_linear, write_dataset_config, write_scene

@@ -10,13 +10,13 @@ import pytest
 import torch
 from scenes_for_tests import build, furnished
 
-from zerobev.config import CameraConfig, TextureConfig
 from zerobev.common.errors import InputError
-from zerobev.training.loader import batches, gpu_workers
+from zerobev.config import CameraConfig, TextureConfig
+from zerobev.data.samples import SemanticPass, SynthTuples, ViewSet
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank
-from zerobev.data.samples import SemanticPass, SynthTuples, ViewSet
 from zerobev.data.views import ViewSource
+from zerobev.training.loader import batches, gpu_workers
 
 CAMERA, TEXTURE, CPU = CameraConfig(fpv_px=32, bev_px=20), TextureConfig(tiles=2, tile_px=64), torch.device("cpu")
 

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from scenes_for_tests import box, build, furnished, room
 from transformers import YolosConfig, YolosForObjectDetection
 
-from zerobev.config import CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig
 from zerobev.evaluation.motion import MovingPair, arrow_errors, motion_table, moving_pair, true_flow
+from zerobev.geometry.cameras import Pose
 from zerobev.inference import BevMap, Boxes, Flow, HubDetector, Projector
 from zerobev.inference.boxes import rendered_boxes
 from zerobev.inference.flow import flow_field
 from zerobev.inference.images import LEVELS, binary_images
 from zerobev.inference.pinhole import PinholeView
-from zerobev.scenes.moving import movable, moved
-from zerobev.geometry.cameras import Pose
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer
+from zerobev.scenes.moving import movable, moved
 
 CAMERA = CameraConfig(fpv_px=64, bev_px=40)
 

@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from zerobev.config import AUX, LABELS, SCALES, CameraConfig
 from zerobev.common.errors import InputError
-from zerobev.training.losses import dice_loss, zero_bev_loss
+from zerobev.config import AUX, LABELS, SCALES, CameraConfig
+from zerobev.geometry.projection import map_points, project
 from zerobev.models import VARIANTS, BevModel, ZeroBEV, build, load_model
-from zerobev.report.parameters import main, parameters
 from zerobev.models.fpv_to_bev import reweigh
 from zerobev.models.max_pooling import noisy_or
 from zerobev.models.polar import band_rows
 from zerobev.report.paper import PARAMETERS_M
-from zerobev.geometry.projection import map_points, project
+from zerobev.report.parameters import main, parameters
+from zerobev.training.losses import dice_loss, zero_bev_loss
 
 SMOKE = SCALES["smoke"]
 ROWS = list(VARIANTS)

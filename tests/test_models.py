@@ -7,8 +7,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from zerobev.config import SCALES, CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import SCALES, CameraConfig
 from zerobev.models import ZeroBEV
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandTransformer

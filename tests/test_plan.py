@@ -12,15 +12,15 @@ import torch
 from torch import nn
 from transformers import ResNetConfig, ResNetModel
 
-from zerobev import plan as planning
-from zerobev.config import SCALES, SceneConfig, TextureConfig
-from zerobev.common.errors import InputError, run_command
-from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.models import build
+from zerobev.benchmarks import forecast as planning
 from zerobev.benchmarks.forecast import Network, Plan, kept_bytes, plan
+from zerobev.common.errors import InputError, run_command
+from zerobev.config import SCALES, SceneConfig, TextureConfig
 from zerobev.experiments.records import RecordStore
+from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.runs import run, run_key
 from zerobev.experiments.workspace import Workspace
+from zerobev.models import build
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = replace(

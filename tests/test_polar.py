@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.scenes_for_tests import build, furnished
-from zerobev.config import SCALES, CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import SCALES, CameraConfig
+from zerobev.geometry.cameras import Pose
+from zerobev.geometry.projection import cells_of_pixels, map_points, project
 from zerobev.models.band_transformer import sinusoids
 from zerobev.models.fpv_to_bev import reweigh
 from zerobev.models.polar import PolarToCartesian, band_rows, floor_row
-from zerobev.geometry.cameras import Pose
 from zerobev.rendering.gbuffer import RayCaster
-from zerobev.geometry.projection import cells_of_pixels, map_points, project
 
 EDGES = (0.0, 0.8, 2.0, 3.8, 5.0)
 cameras = st.builds(

@@ -7,8 +7,8 @@ import pytest
 from scenes_for_tests import Thing, box, build, furnished, room, table
 from scipy.stats import chisquare, kstest
 
-from zerobev.config import AgentConfig
 from zerobev.common.errors import InputError
+from zerobev.config import AgentConfig
 from zerobev.rendering.poses import NavigableFloor, navigable_floor
 
 AGENT = AgentConfig()

@@ -12,16 +12,17 @@ from PIL import Image
 from safetensors import safe_open
 
 import zerobev
-from zerobev.config import SCALES, CameraConfig
 from zerobev.common.errors import InputError, run_command
+from zerobev.config import SCALES, CameraConfig
+from zerobev.experiments.depth_pretraining import DepthPretraining
+from zerobev.experiments.release import SCALE, halve, runs
+from zerobev.experiments.workspace import ROOT, Workspace
+from zerobev.geometry.projection import project
 from zerobev.inference.images import LEVELS
+from zerobev.inference.project import main, read_labels, read_mask, read_photograph
+from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS, run_of, shipped
 from zerobev.models import build, load_model
 from zerobev.models.depth import DepthNet
-from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.inference.project import main, read_labels, read_mask, read_photograph
-from zerobev.geometry.projection import project
-from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS, SCALE, halve, run_of, runs, shipped
-from zerobev.experiments.workspace import ROOT, Workspace
 
 SIDE = SCALES[SCALE].camera.fpv_px
 CAMERA = CameraConfig(fpv_px=SIDE, bev_px=40)

@@ -10,23 +10,14 @@ from matplotlib.colors import to_rgb
 from records_for_tests import record
 from scenes_for_tests import box, build, room
 
-from zerobev.report.own_rows import OWN_CLAIMS
-from zerobev.report.claims import judge
 from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.evaluation.metrics import Counts
-from zerobev.report.paper import CLAIMS, TABLES
 from zerobev.experiments.records import Record
-from zerobev.report.tables import (
-    COLORS,
-    Checks,
-    flat,
-    label_image,
-    maps_image,
-    plan,
-    scoreboard,
-    table,
-    verdict_table,
-)
+from zerobev.report.claims import judge
+from zerobev.report.figures import COLORS, flat, label_image, maps_image, plan
+from zerobev.report.own_rows import OWN_CLAIMS
+from zerobev.report.paper import CLAIMS, TABLES
+from zerobev.report.tables import Checks, scoreboard, table, verdict_table
 
 ROWS = TABLES[1]
 

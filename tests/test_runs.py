@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 import torch
 
-from zerobev import runs
-from zerobev.config import SCALES, SceneConfig, TextureConfig, TrainConfig
 from zerobev.common.errors import InputError
-from zerobev.experiments.registry import EXPERIMENTS, experiment
+from zerobev.config import SCALES, SceneConfig, TextureConfig, TrainConfig
+from zerobev.data.samples import semantic_batches
+from zerobev.experiments import runs
+from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.gallery import gallery
-from zerobev.training.losses import dice_loss
+from zerobev.experiments.records import RecordStore
+from zerobev.experiments.registry import EXPERIMENTS, experiment
+from zerobev.experiments.runs import InTurn, recorded, records_of, run, run_key, stream, train_run
+from zerobev.experiments.spot_check import spot_check
+from zerobev.experiments.workspace import Workspace
+from zerobev.geometry.projection import project
 from zerobev.models import ZeroBEV
 from zerobev.models.variants import VARIANTS
 from zerobev.report.paper import TABLES
-from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.experiments.records import RecordStore
-from zerobev.experiments.runs import InTurn, recorded, records_of, run, run_key, stream, train_run
-from zerobev.experiments.spot_check import spot_check
-from zerobev.geometry.projection import project
-from zerobev.data.samples import semantic_batches
-from zerobev.experiments.workspace import Workspace
+from zerobev.training.losses import dice_loss
 
 PROJECTION, ESTIMATED, ZERO_BEV, RESIDUAL = (EXPERIMENTS[row] for row in ("a.1", "a.2", "c", "d"))
 TINY = replace(

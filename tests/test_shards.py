@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scenes_for_tests import build, furnished, room
 
-from zerobev.config import CameraConfig, TextureConfig
 from zerobev.common.errors import InputError
-from zerobev.scenes.scene import Scene
-from zerobev.geometry.cameras import Pose
-from zerobev.rendering.gbuffer import RayCaster
-from zerobev.rendering.photograph import Photographer
-from zerobev.geometry.projection import fov_mask
+from zerobev.config import CameraConfig, TextureConfig
 from zerobev.data.shards import Shard, checksum, write_shard
 from zerobev.data.views import View, ViewSource
+from zerobev.geometry.cameras import Pose
+from zerobev.geometry.projection import fov_mask
+from zerobev.rendering.gbuffer import RayCaster
+from zerobev.rendering.photograph import Photographer
+from zerobev.scenes.scene import Scene
 
 CAMERA = CameraConfig(fpv_px=16, bev_px=10)
 TEXTURE = TextureConfig()

@@ -9,15 +9,15 @@ import pytest
 from scenes_for_tests import build, furnished
 from scipy import ndimage
 
-from zerobev.config import CameraConfig, Scale, scale
+from zerobev.benchmarks import data as benchmark
+from zerobev.benchmarks.data import noise_bank, texture_images
 from zerobev.common.errors import run_command
-from zerobev.scenes.hm3dsem_writer import write_scene
-from zerobev.scenes.scene import Scene
+from zerobev.config import CameraConfig, Scale, scale
 from zerobev.geometry.cameras import Pose
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.rerender import Rerenderer
-from zerobev.streams import benchmark
-from zerobev.benchmarks.data import noise_bank, texture_images
+from zerobev.scenes.hm3dsem_writer import write_scene
+from zerobev.scenes.scene import Scene
 
 CAMERA = CameraConfig(fpv_px=64, bev_px=50)
 POSES = (Pose(2.0, 0.5, 0, 1.0), Pose(4.4, 2.4, 0, -2.9), Pose(0.6, 3.5, 0, -0.7))

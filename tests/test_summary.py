@@ -9,15 +9,15 @@ import pandas as pd
 import pytest
 from records_for_tests import record
 
-from zerobev import summary
-from zerobev.report.own_rows import OWN_CLAIMS, OWN_ROWS
-from zerobev.report.claims import judge
 from zerobev.config import LABELS
 from zerobev.experiments.registry import EXPERIMENTS
+from zerobev.experiments.workspace import Workspace
+from zerobev.report import page as summary
+from zerobev.report.claims import judge
+from zerobev.report.own_rows import OWN_CLAIMS, OWN_ROWS
+from zerobev.report.page import write_summary
 from zerobev.report.paper import CLAIMS, RATIOS, TABLES
 from zerobev.report.tables import rows_of, table
-from zerobev.report.page import write_summary
-from zerobev.experiments.workspace import Workspace
 
 BASE = np.linspace(20, 40, 6)[:, None] + np.zeros(8)
 

@@ -12,8 +12,8 @@ from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 from skimage.feature import local_binary_pattern
 
-from zerobev.config import TextureConfig
 from zerobev.common.errors import InputError
+from zerobev.config import TextureConfig
 from zerobev.data.patterns import KINDS, PHOTOGRAPHS, SourceImages, photograph, procedural
 from zerobev.data.textures import (
     KERNELS,

@@ -13,11 +13,11 @@ from scipy.optimize import linprog, minimize
 
 from zerobev import config
 from zerobev.config import CameraConfig
+from zerobev.geometry.projection import cells_of_pixels
 from zerobev.models.band_transformer import BandAttention
 from zerobev.models.fpv_to_bev import columns, reweigh
 from zerobev.models.polar import band_rows
 from zerobev.models.variants import build
-from zerobev.geometry.projection import cells_of_pixels
 from zerobev.theory.attended import attended, column_attention
 from zerobev.theory.attention import CrossAttention, divergence, total_variation, train, zero_shot_error
 from zerobev.theory.correspondence import (

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from safetensors.torch import load_file, load_model
 from torch import Tensor, nn
 
-from zerobev.config import TrainConfig
 from zerobev.common.errors import InputError
-from zerobev.learning import train as training
+from zerobev.config import TrainConfig
+from zerobev.training import train as training
 from zerobev.training.history import History
 from zerobev.training.losses import Losses, dice_loss
 from zerobev.training.schedule import Schedule

@@ -11,19 +11,18 @@ import pandas as pd
 import pytest
 
 from zerobev.benchmarks.run import recorded_benchmark
-from zerobev.report.own_rows import OWN_CLAIMS
-from zerobev.report.claims import compare, judge
 from zerobev.config import SCALES
-from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.evaluation.metrics import Counts
-from zerobev.evaluation.motion import recorded_motion
-from zerobev.evaluation.unseen import recorded_unseen
-from zerobev.report.paper import CLAIMS, RATIOS, TABLES
+from zerobev.experiments.recorded import recorded_motion, recorded_unseen
 from zerobev.experiments.records import Record, RecordStore
-from zerobev.report.tables import table
+from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.runs import recorded
-from zerobev.report.page import TABLES as TITLES
 from zerobev.experiments.workspace import ROOT, Workspace
+from zerobev.report.claims import compare, judge
+from zerobev.report.own_rows import OWN_CLAIMS
+from zerobev.report.page import TABLES as TITLES
+from zerobev.report.paper import CLAIMS, RATIOS, TABLES
+from zerobev.report.tables import table
 
 REPORTS = [ROOT / "reports" / scale for scale in SCALES if (ROOT / "reports" / scale / "records").is_dir()]
 PAPER = ROOT.parent / "shared/paper/zero-bev.tex"
@@ -61,8 +60,8 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
     ("read", "starts_with"),
     [
         (recorded_benchmark, "zerobev.benchmarks.run.measure"),
-        (recorded_motion, "zerobev.evaluation.motion.ensure_homes"),
-        (recorded_unseen, "zerobev.evaluation.unseen.ensure_homes"),
+        (recorded_motion, "zerobev.experiments.recorded.ensure_homes"),
+        (recorded_unseen, "zerobev.experiments.recorded.ensure_homes"),
     ],
 )
 def test_what_is_measured_once_was_measured_by_this_code(monkeypatch, read, starts_with: str):

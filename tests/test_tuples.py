@@ -9,11 +9,8 @@ import torch
 from scenes_for_tests import build, furnished, room
 from scipy import ndimage
 
-from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.common.errors import InputError
-from zerobev.geometry.projection import cells_of_pixels, map_points, project
-from zerobev.data.shards import Shard, write_shard
-from zerobev.data.textures import MODSEM_DRAWS, TextureBank
+from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.data.samples import (
     DepthProjTuples,
     ModSemTuples,
@@ -27,7 +24,10 @@ from zerobev.data.samples import (
     semantic_sample,
     view_sample,
 )
+from zerobev.data.shards import Shard, write_shard
+from zerobev.data.textures import MODSEM_DRAWS, TextureBank
 from zerobev.data.views import View, ViewSource
+from zerobev.geometry.projection import cells_of_pixels, map_points, project
 
 CAMERA = CameraConfig(fpv_px=24, bev_px=20)
 TEXTURE = TextureConfig(tiles=4)

@@ -8,12 +8,12 @@ import torch
 from scenes_for_tests import build, furnished
 
 from zerobev.config import LABELS, CameraConfig, TextureConfig
-from zerobev.learning import unseen
+from zerobev.data.views import View, ViewSource
+from zerobev.evaluation import unseen
 from zerobev.evaluation.metrics import Counts
 from zerobev.evaluation.unseen import MODALITIES, evaluate_unseen, unseen_masks, unseen_table
-from zerobev.scenes.hm3dsem_writer import write_scene
 from zerobev.geometry.projection import cells_of_pixels
-from zerobev.data.views import View, ViewSource
+from zerobev.scenes.hm3dsem_writer import write_scene
 
 CAMERA = CameraConfig(fpv_px=64, bev_px=40)
 

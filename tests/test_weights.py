@@ -9,8 +9,8 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from transformers import ResNetConfig, ResNetForImageClassification
 
-from zerobev.config import SCALES
 from zerobev.common.errors import InputError
+from zerobev.config import SCALES
 from zerobev.models.backbone import RgbEncoder
 from zerobev.models.backbone_weights import load_backbone, torchvision_name
 

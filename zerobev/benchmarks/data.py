@@ -19,20 +19,20 @@ import joblib
 import numpy as np
 import torch
 
-from zerobev.config import SCALES, CameraConfig, Scale, scale
 from zerobev.common.errors import run_command
+from zerobev.common.storage import write_json
+from zerobev.config import SCALES, CameraConfig, Scale, scale
+from zerobev.data.samples import DepthProjTuples, ModSemTuples, SynthTuples, TupleStream, ViewSet
+from zerobev.data.shards import Shard, write_shard
+from zerobev.data.textures import TextureBank, modsem_textures, random_rectangles
+from zerobev.data.views import View, ViewSource
+from zerobev.geometry.cameras import Pose
+from zerobev.geometry.projection import project_mask
+from zerobev.rendering.rerender import Rerenderer
 from zerobev.scenes.hm3dsem import read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 from zerobev.scenes.indoor import generate_home
 from zerobev.scenes.scene import Scene
-from zerobev.geometry.cameras import Pose
-from zerobev.rendering.rerender import Rerenderer
-from zerobev.common.storage import write_json
-from zerobev.geometry.projection import project_mask
-from zerobev.data.shards import Shard, write_shard
-from zerobev.data.textures import TextureBank, modsem_textures, random_rectangles
-from zerobev.data.samples import DepthProjTuples, ModSemTuples, SynthTuples, TupleStream, ViewSet
-from zerobev.data.views import View, ViewSource
 
 DENSITIES = (0.10, 0.15, 0.20, 0.25, 0.30)  #: shares of white texels (paper, Table 4)
 WORKERS = (1, 2)

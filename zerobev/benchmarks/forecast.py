@@ -18,25 +18,25 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from zerobev.config import SCALES, Scale
+from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
 from zerobev.common.errors import InputError, run_command
-from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.training.depth import DepthTuples, depth_objective
+from zerobev.config import SCALES, Scale
+from zerobev.data.generate import shard_path
+from zerobev.data.samples import SynthTuples, ViewSet, collate, semantic_sample
+from zerobev.data.shards import Shard, write_shard
+from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import model_inputs
-from zerobev.training.loader import Source, gpu_workers
-from zerobev.training.train import Objective, dice_objective, training_accelerator
-from zerobev.models import build
-from zerobev.models.depth import DepthNet
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.records import RecordStore, peak_memory_mb
+from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.runs import SEEDS, run_key
-from zerobev.scenes.hm3dsem import read_scene
-from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
-from zerobev.data.generate import shard_path
-from zerobev.data.shards import Shard, write_shard
-from zerobev.data.samples import SynthTuples, ViewSet, collate, semantic_sample
-from zerobev.data.views import ViewSource
 from zerobev.experiments.workspace import Workspace, fingerprint
+from zerobev.models import build
+from zerobev.models.depth import DepthNet
+from zerobev.scenes.hm3dsem import read_scene
+from zerobev.training.depth import DepthTuples, depth_objective
+from zerobev.training.loader import Source, gpu_workers
+from zerobev.training.train import Objective, dice_objective, training_accelerator
 
 _VIEWS, _SECONDS = 4, 4.0  # views that are stored and trained on; seconds in which they are counted
 _SAMPLES = {"cpu": 2, "cuda": 8}  # of a pass; with fewer a GPU has little to do

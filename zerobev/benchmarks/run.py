@@ -17,15 +17,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from zerobev.config import SCALES, Scale, scale
-from zerobev.common.errors import run_command
+from zerobev.benchmarks import data as generation
 from zerobev.benchmarks.training import Machine, Run, measure_paper_step, measure_training, training_step
-from zerobev.models import BevModel, build
-from zerobev.experiments.records import kept, peak_memory_mb
+from zerobev.common.errors import run_command
 from zerobev.common.storage import write_json
-from zerobev.streams import benchmark as generation
+from zerobev.config import SCALES, Scale, scale
 from zerobev.data.samples import SynthTuples
+from zerobev.experiments.records import kept, peak_memory_mb
 from zerobev.experiments.workspace import Workspace
+from zerobev.models import BevModel, build
 
 MODALITIES = (1, 8, 40)  #: zero-shot images of one photograph
 ROWS = ("c", "e", "f")  #: that inference is measured of

@@ -17,14 +17,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode, flop_registry
 
+from zerobev.benchmarks.data import spread
 from zerobev.config import CameraConfig, Scale, scale
+from zerobev.data.samples import SynthTuples
+from zerobev.experiments.workspace import Workspace
+from zerobev.models import BevModel, ZeroBEV, build
 from zerobev.training.loader import Source, batches
 from zerobev.training.losses import zero_bev_loss
 from zerobev.training.precision import computes_bfloat16
-from zerobev.models import BevModel, ZeroBEV, build
-from zerobev.benchmarks.data import spread
-from zerobev.data.samples import SynthTuples
-from zerobev.experiments.workspace import Workspace
 
 _MATMUL = 2048  # side of the matrices whose product is the machine's peak
 _COPIED = 2**24  # numbers, float32, whose copy is the machine's bandwidth

@@ -18,14 +18,14 @@ import joblib
 import numpy as np
 
 from zerobev import config
-from zerobev.config import CameraConfig, TextureConfig
 from zerobev.common.errors import InputError, run_command
 from zerobev.common.parallel import cluster, run_jobs
 from zerobev.common.progress import progress
-from zerobev.scenes.hm3dsem import read_scene, split_scenes
 from zerobev.common.storage import write_json
+from zerobev.config import CameraConfig, TextureConfig
 from zerobev.data.shards import Shard, checksum, recorded_with, write_shard
 from zerobev.data.views import ViewSource
+from zerobev.scenes.hm3dsem import read_scene, split_scenes
 
 _PARTS = ("train", "validation", "test")
 _MANIFEST = "manifest.json"

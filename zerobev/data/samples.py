@@ -13,13 +13,13 @@ from functools import cache
 import numpy as np
 import torch
 
-from zerobev.config import LABELS, CameraConfig
 from zerobev.common.errors import InputError
-from zerobev.geometry.cameras import Pose, bev_cell_centres
-from zerobev.geometry.projection import map_coordinates, project_mask
+from zerobev.config import LABELS, CameraConfig
 from zerobev.data.shards import Shard
 from zerobev.data.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.data.views import View
+from zerobev.geometry.cameras import Pose, bev_cell_centres
+from zerobev.geometry.projection import map_coordinates, project_mask
 
 Sample = dict[str, np.ndarray | np.int64]
 #: The images of K modalities in FPV (K, H, H) and the same on the map (K, M, M), bool or float.

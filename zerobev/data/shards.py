@@ -13,11 +13,11 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from zerobev.config import CameraConfig, TextureConfig
 from zerobev.common.errors import InputError
-from zerobev.scenes.scene import Scene
 from zerobev.common.storage import replacing
+from zerobev.config import CameraConfig, TextureConfig
 from zerobev.data.views import View
+from zerobev.scenes.scene import Scene
 
 _FIELDS = tuple(field.name for field in fields(View))
 

@@ -13,10 +13,10 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from zerobev.config import TextureConfig
 from zerobev.common.errors import InputError
 from zerobev.common.progress import progress
 from zerobev.common.storage import replacing
+from zerobev.config import TextureConfig
 from zerobev.data.patterns import SourceImages
 
 KERNELS = ("ellipse", "square", "cross")

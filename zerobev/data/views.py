@@ -4,15 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from zerobev.config import AgentConfig, CameraConfig, TextureConfig
 from zerobev.common.errors import InputError
-from zerobev.scenes.scene import Scene
+from zerobev.config import AgentConfig, CameraConfig, TextureConfig
+from zerobev.data.textures import MODSEM_DRAWS, modsem_textures
 from zerobev.geometry.cameras import Pose
+from zerobev.geometry.projection import fov_mask
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer
 from zerobev.rendering.poses import navigable_floor
-from zerobev.geometry.projection import fov_mask
-from zerobev.data.textures import MODSEM_DRAWS, modsem_textures
+from zerobev.scenes.scene import Scene
 
 _GLANCE_PX = 64  # a larger image is cast only where one of this size sees enough of the map
 _TRIES = 50  # poses drawn for one view before the scene is given up

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from zerobev.config import CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig
 from zerobev.geometry.projection import cells_of_pixels
 
 #: Steps of each colour channel that `colour_of_cells` tells apart.

@@ -1,17 +1,15 @@
-"""Predicted maps against true ones, for learned models and geometric baselines alike.
+"""Predicted maps against true ones, for learned models and geometric baselines alike."""
 
-As a command, `zerobev.evaluation.real_homes`: the shipped weights on a folder of homes.
-"""
-
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
 from torch import Tensor, distributed, nn
 
 from zerobev.evaluation.metrics import Counts, count
+from zerobev.training.distributed import rank_and_world_size
+from zerobev.training.loader import Batch, model_inputs
 
-Batch = Mapping[str, Tensor]
 #: From a batch to maps (B, K, M, M): floating-point logits, or booleans that are taken as they are.
 Predictor = Callable[[Batch], Tensor]
 
@@ -35,15 +33,8 @@ def evaluate(
     return _over_processes(total)
 
 
-def place() -> tuple[int, int]:
-    """Rank of this process, and the number of those that train and evaluate together: (0, 1) where it is alone."""
-    if not distributed.is_initialized():
-        return 0, 1
-    return distributed.get_rank(), distributed.get_world_size()
-
-
 def _over_processes(counts: Counts) -> Counts:
-    if place()[1] == 1:
+    if rank_and_world_size()[1] == 1:
         return counts
     device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
     sums = torch.from_numpy(np.stack((counts.intersection, counts.union))).to(device)
@@ -62,15 +53,3 @@ def model_predictor(model: nn.Module, device: torch.device | str) -> Predictor:
         return model(*(image.to(device) for image in model_inputs(batch))).zero_logits
 
     return predict
-
-
-def model_inputs(batch: Batch) -> list[Tensor]:
-    """What a model is called with: `rgb`, `zero`, and `depth` where the batch has it."""
-    return [batch[name] for name in ("rgb", "zero", "depth") if name in batch]
-
-
-if __name__ == "__main__":
-    from zerobev.common.errors import run_command
-    from zerobev.evaluation.real_homes import main
-
-    run_command(main)

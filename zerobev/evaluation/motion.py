@@ -1,12 +1,11 @@
-"""Flow on the map against true motion: `python -m zerobev.evaluation.motion --scenes DIR [--pairs N] [--json FILE]`.
+"""Flow on the map against true motion.
 
 In generated homes an object is moved between two photographs of a camera that stands still, so that the motion of each
 of its pixels on the map is known. Rows are projections: P^-1 with estimated depth (a.2), and the networks that ship.
 """
 
-import argparse
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +13,20 @@ import pandas as pd
 import torch
 from scipy.stats import bootstrap
 
+from zerobev.common.errors import InputError
+from zerobev.common.progress import progress
 from zerobev.config import AgentConfig, CameraConfig
-from zerobev.common.errors import InputError, run_command
+from zerobev.geometry.projection import map_points
 from zerobev.inference.bev_map import BevArrows
 from zerobev.inference.flow import Flow, flow_field
 from zerobev.inference.projector import GEOMETRIC, Projector, load
-from zerobev.common.progress import progress
-from zerobev.experiments.records import kept
-from zerobev.scenes.hm3dsem import find_scenes, read_scene
-from zerobev.scenes.homes import ensure_homes
-from zerobev.scenes.moving import movable, moved
-from zerobev.scenes.scene import Scene
+from zerobev.inference.shipped_weights import ROWS
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer
 from zerobev.rendering.poses import navigable_floor
-from zerobev.common.storage import write_json
-from zerobev.geometry.projection import map_points
-from zerobev.inference.shipped_weights import ROWS, shipped_runs
-from zerobev.experiments.workspace import Workspace
+from zerobev.scenes.hm3dsem import read_scene
+from zerobev.scenes.moving import movable, moved
+from zerobev.scenes.scene import Scene
 
 #: Side of the photographs: flow needs finer ones than the networks do.
 PHOTOGRAPH_PX = 256
@@ -169,39 +164,3 @@ def moving_pairs(folders: list[Path], count: int, seed: int) -> Iterator[MovingP
             continue
         yield pair
         found += 1
-
-
-def recorded_motion(workspace: Workspace, count: int = 32) -> pd.DataFrame:
-    """Errors of `count` pairs of a workspace's generated test homes: read where they are recorded, else computed.
-
-    The record `motion.json` of the report names the weights that it is of; those of other weights are computed again.
-    """
-    homes = list(workspace.split.test)
-
-    def compute() -> dict[str, list]:
-        ensure_homes(homes, workspace.scale.scenes.seed, 1)
-        return evaluate_motion(moving_pairs(homes, count, seed=0)).to_dict(orient="list")
-
-    identity = {"weights": shipped_runs(), "pairs": count, "scenes": asdict(workspace.scale.scenes)}
-    return pd.DataFrame(kept(workspace.reports / "motion.json", identity, compute))
-
-
-def main() -> None:
-    """Parse the command line, move objects, print the table."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.evaluation.motion", description=__doc__)
-    parser.add_argument("--scenes", type=Path, required=True, help="folder of generated homes; its val/ is used")
-    parser.add_argument("--pairs", type=int, default=32, help="at most one a home")
-    parser.add_argument("--seed", type=int, default=0, help="of poses, objects and shifts")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the errors of every pair there")
-    options = parser.parse_args()
-    folders = find_scenes(options.scenes)["val"]
-    errors = evaluate_motion(moving_pairs(folders, options.pairs, options.seed))
-    if errors.empty:
-        raise InputError(f"{options.scenes}: expected homes in which an object can be moved, found none")
-    print(motion_table(errors).to_string())
-    if options.json:
-        write_json(options.json, errors.to_dict(orient="records"))
-
-
-if __name__ == "__main__":
-    run_command(main)

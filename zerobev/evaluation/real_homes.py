@@ -15,18 +15,18 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.common.errors import InputError
-from zerobev.evaluation.evaluate import Predictor, evaluate
-from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
-from zerobev.inference.projector import GEOMETRIC, load
 from zerobev.common.progress import progress
-from zerobev.scenes.hm3dsem import find_scenes, read_scene
 from zerobev.common.storage import write_json
-from zerobev.geometry.projection import project
+from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.data.samples import class_masks, collate, view_sample
 from zerobev.data.views import ViewSource
+from zerobev.evaluation.evaluate import Predictor, evaluate
+from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
+from zerobev.geometry.projection import project
+from zerobev.inference.projector import GEOMETRIC, load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
+from zerobev.scenes.hm3dsem import find_scenes, read_scene
 
 ORACLE = "a.1"
 METHODS = {ORACLE: "P^-1 with true depth", GEOMETRIC: "P^-1 with estimated depth"} | {

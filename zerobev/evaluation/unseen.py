@@ -6,28 +6,23 @@ meaning, and what a robot could do where.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
 from skimage.segmentation import find_boundaries
 
-from zerobev.config import LABELS, NO_LABEL, CameraConfig, TextureConfig
-from zerobev.evaluation.evaluate import evaluate
-from zerobev.evaluation.metrics import Counts, bootstrap_interval, iou_per_class
-from zerobev.inference.projector import GEOMETRIC, load
 from zerobev.common.progress import progress
-from zerobev.experiments.records import kept
-from zerobev.scenes.hm3dsem import read_scene
-from zerobev.scenes.homes import ensure_homes
-from zerobev.geometry.projection import map_points
+from zerobev.config import LABELS, NO_LABEL, CameraConfig, TextureConfig
 from zerobev.data.samples import Pair, collate, view_sample
 from zerobev.data.views import View, ViewSource
-from zerobev.inference.shipped_weights import ROWS, shipped_runs
-from zerobev.experiments.workspace import Workspace
+from zerobev.evaluation.evaluate import evaluate
+from zerobev.evaluation.metrics import Counts, bootstrap_interval, iou_per_class
+from zerobev.geometry.projection import map_points
+from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.inference.shipped_weights import ROWS
+from zerobev.scenes.hm3dsem import read_scene
 
 #: name -> what is white
 MODALITIES = {
@@ -37,7 +32,7 @@ MODALITIES = {
     "to sit on": "chairs, sofas, beds and toilets together",
     "to put things on": "surfaces 0.4 to 1.1 m above the floor that are no wall",
 }
-_VIEWS = 10  # of each home
+VIEWS = 10  # of each home
 _LEAST_PX = 20  # an instance with fewer pixels is no mask
 _BLOCK = 50  # texels of a random label, 1 cm each
 _LABELS = 4
@@ -75,7 +70,7 @@ def unseen_masks(
     return {name: (images[0][name], images[1][name]) for name in MODALITIES}
 
 
-def evaluate_unseen(folders: Iterable[Path], views: int = _VIEWS) -> dict[str, Counts]:
+def evaluate_unseen(folders: Iterable[Path], views: int = VIEWS) -> dict[str, Counts]:
     """Intersections and unions of the projection (a.2) and the shipped networks, a column a modality.
 
     folders: of scenes in HM3DSem layout, each of which is rendered at `views` fresh poses
@@ -115,19 +110,3 @@ def unseen_table(counts: Mapping[str, Counts]) -> pd.DataFrame:
             f"{100 * value:.1f} [{100 * a:.1f}, {100 * b:.1f}]" for value, a, b in zip(one.iou_per_class(), low, high)
         ]
     return pd.DataFrame(cells, index=pd.Index(MODALITIES, name="modality"))
-
-
-def recorded_unseen(workspace: Workspace) -> dict[str, Counts]:
-    """`evaluate_unseen` of a workspace's generated test homes: read where it is recorded, else computed.
-
-    The record `unseen.json` of the report names the weights that it is of; those of other weights are computed again.
-    """
-    homes = list(workspace.split.test)
-
-    def compute() -> dict[str, Any]:
-        ensure_homes(homes, workspace.scale.scenes.seed, 1)
-        return {row: counts.to_json() for row, counts in evaluate_unseen(homes).items()}
-
-    identity = {"weights": shipped_runs(), "views": _VIEWS, "scenes": asdict(workspace.scale.scenes)}
-    found = kept(workspace.reports / "unseen.json", identity, compute)
-    return {row: Counts.from_json(counts) for row, counts in found.items()}

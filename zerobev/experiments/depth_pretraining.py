@@ -16,13 +16,13 @@ import numpy as np
 import torch
 
 from zerobev.common.errors import InputError
-from zerobev.training.depth import depth_errors, predict_depth, train_depth
-from zerobev.evaluation.evaluate import place
-from zerobev.models.depth import DepthNet
-from zerobev.experiments.records import git_revision, is_fresh, origin, peak_memory_mb
 from zerobev.common.storage import replacing, write_json
 from zerobev.data.samples import ViewSet
+from zerobev.experiments.records import git_revision, is_fresh, origin, peak_memory_mb
 from zerobev.experiments.workspace import Workspace, fingerprint
+from zerobev.models.depth import DepthNet
+from zerobev.training.depth import depth_errors, predict_depth, train_depth
+from zerobev.training.distributed import rank_and_world_size
 
 #: Raised by hand whenever depth training changes what it computes.
 DEPTH_VERSION = 1
@@ -74,7 +74,7 @@ class DepthPretraining:
             except (ValueError, KeyError, TypeError) as error:
                 raise InputError(f"{path}: expected the record of a depth estimator, found {error}") from None
         record = self._compute()
-        if place()[0] == 0:
+        if rank_and_world_size()[0] == 0:
             write_json(path, record)
         return record
 
@@ -112,7 +112,7 @@ class DepthPretraining:
         trained = time.monotonic()
         device = next(network.parameters()).device.type
         errors = depth_errors(network, workspace.views("test"), device)
-        if place()[0] == 0:  # of several processes
+        if rank_and_world_size()[0] == 0:  # of several processes
             network.cpu().save(self._weights)
         shutil.rmtree(workspace.cache / self.key, ignore_errors=True)  # depth that earlier weights predicted
         (workspace.runs / self.key / "checkpoint.pt").unlink(missing_ok=True)

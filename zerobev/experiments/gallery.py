@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from zerobev.experiments.records import RecordStore
 from zerobev.data.samples import ViewSet
+from zerobev.experiments.records import RecordStore
 from zerobev.experiments.workspace import Workspace, fingerprint
 
 GALLERY_VIEWS = 8

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from zerobev.common.errors import InputError
-from zerobev.evaluation.metrics import Counts
 from zerobev.common.storage import replacing, write_json
+from zerobev.evaluation.metrics import Counts
 
 # what reading JSON raises for a file that is something else
 _NO_RECORD = (OSError, ValueError, KeyError, TypeError, RecursionError)
@@ -168,7 +168,7 @@ def is_fresh(path: Path) -> bool:
     return path.stat().st_mtime >= float(os.environ.get("ZEROBEV_FRESH", 0))
 
 
-def git_revision(code: Path = Path(__file__).parent) -> str:
+def git_revision(code: Path = Path(__file__).parents[1]) -> str:
     """The commit that `code` is checked out at, with "-dirty" where it differs; "unknown" outside a checkout.
 
     Reports and notebooks may differ: a reproduction writes them.

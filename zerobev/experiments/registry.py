@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from zerobev.config import ModelConfig, Scale, TextureConfig
 from zerobev.common.errors import InputError
+from zerobev.config import ModelConfig, Scale, TextureConfig
 from zerobev.models.variants import VARIANTS
 
 

@@ -16,23 +16,9 @@ from typing import Any
 import torch
 from accelerate import PartialState
 
-from zerobev.config import LABELS, SCALES, CameraConfig, Scale
 from zerobev.common.errors import run_command
-from zerobev.experiments.registry import EXPERIMENTS, Experiment, experiment
-from zerobev.experiments.gallery import gallery_indices
-from zerobev.evaluation.evaluate import Predictor, evaluate, model_predictor, place
-from zerobev.training.history import History
-from zerobev.training.loader import Batch, Source, batches
-from zerobev.training.monitor import maps_figure
-from zerobev.training.train import dice_objective, train
-from zerobev.models.base import BevModel
-from zerobev.models.variants import VARIANTS, build
-from zerobev.models.vpn import VPN
-from zerobev.models.backbone_weights import load_backbone
 from zerobev.common.parallel import cluster
-from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.experiments.records import Record, RecordStore, git_revision, origin, peak_memory_mb
-from zerobev.geometry.projection import project
+from zerobev.config import LABELS, SCALES, CameraConfig, Scale
 from zerobev.data.samples import (
     DepthProjTuples,
     ModSemTuples,
@@ -43,7 +29,22 @@ from zerobev.data.samples import (
     collate,
     semantic_sample,
 )
+from zerobev.evaluation.evaluate import Predictor, evaluate, model_predictor
+from zerobev.experiments.depth_pretraining import DepthPretraining
+from zerobev.experiments.gallery import gallery_indices
+from zerobev.experiments.records import Record, RecordStore, git_revision, origin, peak_memory_mb
+from zerobev.experiments.registry import EXPERIMENTS, Experiment, experiment
 from zerobev.experiments.workspace import ROOT, Workspace, fingerprint
+from zerobev.geometry.projection import project
+from zerobev.models.backbone_weights import load_backbone
+from zerobev.models.base import BevModel
+from zerobev.models.variants import VARIANTS, build
+from zerobev.models.vpn import VPN
+from zerobev.training.distributed import rank_and_world_size
+from zerobev.training.history import History
+from zerobev.training.loader import Batch, Source, batches
+from zerobev.training.monitor import maps_figure
+from zerobev.training.train import dice_objective, train
 
 #: Raised by hand whenever training or evaluation change what they compute: older records are then left aside.
 RECIPE_VERSION = 4
@@ -119,7 +120,7 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
     trained = time.monotonic()
     views = test.first(workspace.scale.test_views)
     passed = SemanticPass(views, workspace.scale.camera, _EVALUATION_BATCH)
-    rank, ranks = place()
+    rank, ranks = rank_and_world_size()
     drawn = batches(passed, range(rank, len(passed), ranks), torch.device(device))
     counts = evaluate(predict, drawn, len(test.shards), len(LABELS))
     record = Record(
@@ -137,7 +138,7 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
         counts=counts,
         history=history.curves() if history else {},
     )
-    if place()[0] > 0:
+    if rank_and_world_size()[0] > 0:
         return record
     batch = collate([semantic_sample(test, i, workspace.scale.camera) for i in gallery_indices(test)])
     with torch.inference_mode():
@@ -171,7 +172,7 @@ def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str)
     objective = dice_objective(config.alpha, model.config.aux)
     data = InTurn(stages, config.steps)
     history = train(model, data, validation, config, folder, seed, key=key, objective=objective, picture=maps_figure)
-    if place()[0] == 0:
+    if rank_and_world_size()[0] == 0:
         model.save(folder / "model.safetensors")
     return model, history
 

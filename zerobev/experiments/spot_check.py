@@ -16,9 +16,9 @@ import numpy as np
 
 from zerobev import config
 from zerobev.common.errors import InputError, run_command
-from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
 from zerobev.experiments.records import Record, RecordStore
+from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.runs import compute, run_key
 from zerobev.experiments.workspace import Workspace
 

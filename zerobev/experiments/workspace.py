@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 
 from zerobev import config
-from zerobev.config import TextureConfig
 from zerobev.common.errors import InputError
+from zerobev.config import TextureConfig
+from zerobev.data.generate import generate, shard_path
+from zerobev.data.patterns import SourceImages
+from zerobev.data.samples import ViewSet
+from zerobev.data.shards import Shard, recorded_with
+from zerobev.data.textures import TextureBank
 from zerobev.scenes.hm3dsem import Split, read_scene, split_scenes
 from zerobev.scenes.homes import ensure_home, ensure_homes, home_folders
 from zerobev.scenes.scene import Scene
-from zerobev.data.generate import generate, shard_path
-from zerobev.data.shards import Shard, recorded_with
-from zerobev.data.patterns import SourceImages
-from zerobev.data.textures import TextureBank
-from zerobev.data.samples import ViewSet
 
 #: Raised by hand whenever homes, sensors or textures change what they make: stale data is then left aside.
 DATA_VERSION = 2
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Workspace:

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
-from zerobev.config import CameraConfig
 from zerobev.common.storage import replacing
+from zerobev.config import CameraConfig
 
 _FLOOR, _OUTSIDE = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
 _LONGEST_LEGEND = 12

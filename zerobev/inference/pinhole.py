@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from zerobev.config import CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig
 
 #: A pixel of the network's image is white where a mask covers this share of it, see `PinholeView.mask`.
 MASK_SHARE = 0.25

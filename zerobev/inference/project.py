@@ -12,11 +12,11 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from zerobev.common.errors import InputError, run_command
+from zerobev.common.storage import replacing
 from zerobev.inference import BevMap, Boxes, HubDetector, load
 from zerobev.inference.bev_map import color_of
 from zerobev.inference.images import BinaryImages, binary_images
 from zerobev.inference.projector import GEOMETRIC
-from zerobev.common.storage import replacing
 from zerobev.inference.shipped_weights import ROWS
 
 _OPACITY = 0.5

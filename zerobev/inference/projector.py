@@ -9,17 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from zerobev.config import CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig
+from zerobev.geometry.projection import fov_mask, project
 from zerobev.inference.bev_map import BevArrows, BevMap
 from zerobev.inference.boxes import Boxes
 from zerobev.inference.flow import Flow
 from zerobev.inference.images import BinaryImages, Names, binary_images
 from zerobev.inference.pinhole import PinholeView
+from zerobev.inference.shipped_weights import DEPTH, ROWS, shipped
 from zerobev.models import TIM, VPN, BevModel, load_model
 from zerobev.models.depth import DepthEstimator, DepthNet
-from zerobev.geometry.projection import fov_mask, project
-from zerobev.inference.shipped_weights import DEPTH, ROWS, shipped
 
 #: The row that is not trained: P^-1 with estimated depth.
 GEOMETRIC = "a.2"

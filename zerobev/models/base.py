@@ -12,10 +12,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from zerobev.config import AUX, CameraConfig, ModelConfig
 from zerobev.common.errors import InputError
-from zerobev.models.backbone import RgbEncoder
 from zerobev.common.storage import replacing
+from zerobev.config import AUX, CameraConfig, ModelConfig
+from zerobev.models.backbone import RgbEncoder
 
 #: Zero-shot images that pass a network together, at most (a batch with more samples passes whole).
 IMAGES_A_PASS = 16

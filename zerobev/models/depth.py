@@ -16,12 +16,12 @@ from transformers import AutoModelForDepthEstimation, PreTrainedModel
 from transformers.image_processing_base import ImageProcessingMixin
 from transformers.utils import IMAGE_PROCESSOR_NAME, cached_file
 
-from zerobev.config import CameraConfig, ModelConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig, ModelConfig
+from zerobev.geometry.cameras import fpv_rays
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
 from zerobev.models.base import BevModel
 from zerobev.models.decoder import convolution, upsample
-from zerobev.geometry.cameras import fpv_rays
 
 #: Nothing that `DepthNet` predicts is farther than this, metres.
 FARTHEST_M = 50.0

@@ -9,8 +9,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from zerobev.config import CameraConfig, ModelConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig, ModelConfig
 from zerobev.models.band_transformer import BandAttention, BandTransformer
 from zerobev.models.polar import PolarToCartesian, band_rows, floor_row
 

@@ -14,12 +14,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
+from zerobev.geometry.projection import project
 from zerobev.models.backbone import RgbEncoder
 from zerobev.models.base import IMAGES_A_PASS, BevModel, Projection
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.polar import PolarToCartesian, floor_row
 from zerobev.models.pyramid import FeaturePyramid
-from zerobev.geometry.projection import project
 
 #: Before training a gate falls by 1 (as a logit) over this share of the image's height, away from the row of the floor.
 _FLOOR_WIDTH = 1 / 32

@@ -15,8 +15,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from zerobev.config import CameraConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig
 
 
 def band_rows(camera: CameraConfig, edges_m: tuple[float, ...]) -> list[range]:

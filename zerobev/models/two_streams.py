@@ -8,8 +8,8 @@ zero-shot  -> zero CNN ------------> weighted sums --> map features -> U-Net -> 
 import torch
 from torch import Tensor, nn
 
-from zerobev.config import CameraConfig, ModelConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
 from zerobev.models.base import IMAGES_A_PASS, BevModel, Projection

@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from zerobev.config import CameraConfig, ModelConfig
 from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig, ModelConfig
 from zerobev.models.base import BevModel, description
 from zerobev.models.depth import DepthNet
 from zerobev.models.max_pooling import MaxPoolZeroBEV

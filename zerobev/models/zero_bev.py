@@ -12,13 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
+from zerobev.geometry.projection import project
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
 from zerobev.models.base import IMAGES_A_PASS, BevModel, Projection
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev
 from zerobev.models.pyramid import FeaturePyramid
-from zerobev.geometry.projection import project
 
 
 class ZeroBEV(BevModel):

@@ -12,8 +12,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from zerobev.config import CameraConfig
-from zerobev.scenes.scene import Scene
 from zerobev.geometry.cameras import Pose, bev_cell_centres, fpv_rays
+from zerobev.scenes.scene import Scene
 
 _STEP_M = 1e-4  # behind a culled face the ray starts again this much farther
 

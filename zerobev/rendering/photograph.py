@@ -6,13 +6,13 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-import pyrender
 import trimesh
 from PIL import Image
 
 from zerobev.config import CameraConfig
-from zerobev.scenes.scene import Scene
 from zerobev.geometry.cameras import Pose
+from zerobev.rendering.opengl import pyrender
+from zerobev.scenes.scene import Scene
 
 _SUPERSAMPLING = 2  # rendered this much larger and averaged: fine textures would flicker otherwise
 _NEAR_M, _FAR_M = 0.05, 100.0

@@ -7,10 +7,10 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy import ndimage
 
-from zerobev.config import LABELS, AgentConfig
 from zerobev.common.errors import InputError
-from zerobev.scenes.scene import Scene
+from zerobev.config import LABELS, AgentConfig
 from zerobev.geometry.cameras import Pose
+from zerobev.scenes.scene import Scene
 
 _SAMPLES_PER_M2 = 2000  # surface samples that find obstacles: five for each 5 cm cell of a horizontal surface
 _LEVEL = 0.9  # a floor face's normal points up at least this much

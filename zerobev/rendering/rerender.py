@@ -1,12 +1,12 @@
 """Pairs the long way, without a G-buffer: every texture is rendered anew, as the paper does. For comparison."""
 
 import numpy as np
-import pyrender
 
 from zerobev.config import CameraConfig
-from zerobev.scenes.scene import Scene
 from zerobev.geometry.cameras import Pose
+from zerobev.rendering.opengl import pyrender
 from zerobev.rendering.photograph import render, world_T_opengl
+from zerobev.scenes.scene import Scene
 
 _NEAREST = pyrender.Sampler(magFilter=pyrender.GLTF.NEAREST, minFilter=pyrender.GLTF.NEAREST)
 _NEAR_M, _FAR_M = 0.05, 100.0

@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from zerobev.config import LABELS
 from zerobev.common.errors import InputError
+from zerobev.config import LABELS
 from zerobev.evaluation.metrics import Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
-from zerobev.report.paper import TABLES, Ordering, Ratio, Row, Similar
 from zerobev.experiments.records import Record
+from zerobev.report.paper import TABLES, Ordering, Ratio, Row, Similar
 
 _DRAWS = 1000
 _LEVEL = 0.9

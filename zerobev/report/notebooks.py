@@ -28,7 +28,7 @@ from zerobev import config
 from zerobev.common.errors import InputError, run_command
 from zerobev.common.storage import replacing
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / ".cache"
 
 

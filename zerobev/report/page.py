@@ -22,17 +22,18 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from zerobev import config
-from zerobev.report.own_rows import OWN_CLAIMS
-from zerobev.report.claims import Verdict, compare, judge
 from zerobev.common.errors import run_command
-from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.experiments.gallery import gallery
-from zerobev.report.paper import CLAIMS, RATIOS
-from zerobev.experiments.records import Record, RecordStore
-from zerobev.report.tables import averages_figure, cost_table, gallery_figure, table
-from zerobev.experiments.runs import SEEDS, recorded
 from zerobev.common.storage import replacing, write_json
+from zerobev.experiments.gallery import gallery
+from zerobev.experiments.records import Record, RecordStore
+from zerobev.experiments.registry import EXPERIMENTS
+from zerobev.experiments.runs import SEEDS, recorded
 from zerobev.experiments.workspace import ROOT, Workspace
+from zerobev.report.claims import Verdict, compare, judge
+from zerobev.report.figures import averages_figure, gallery_figure
+from zerobev.report.own_rows import OWN_CLAIMS
+from zerobev.report.paper import CLAIMS, RATIOS
+from zerobev.report.tables import cost_table, table
 
 #: number -> title; table 6 is not in the paper
 TABLES = {

@@ -6,11 +6,11 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from zerobev.config import SCALES, scale
 from zerobev.common.errors import run_command
+from zerobev.common.storage import write_json
+from zerobev.config import SCALES, scale
 from zerobev.models.variants import VARIANTS, build
 from zerobev.report.paper import PARAMETERS_M
-from zerobev.common.storage import write_json
 
 BLOCKS = (
     *("backbone", "zero_cnn", "pyramid", "bands", "view", "outs", "gates", "values", "embedding", "decoder"),

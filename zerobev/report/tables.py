@@ -1,26 +1,17 @@
-"""Records and the paper's numbers -> the tables and figures that notebooks share."""
+"""Records and the paper's numbers -> the tables that notebooks and the page of results share."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from IPython.display import Markdown
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
-from zerobev.report.own_rows import OWN_ROWS
-from zerobev.report.claims import Verdict
-from zerobev.config import LABELS, CameraConfig
-from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
-from zerobev.report.paper import TABLES
+from zerobev.config import LABELS
 from zerobev.experiments.records import Record
-from zerobev.scenes.scene import Scene
-from zerobev.geometry.cameras import Pose
-from zerobev.rendering.gbuffer import RayCaster
+from zerobev.report.claims import Verdict
+from zerobev.report.own_rows import OWN_ROWS
+from zerobev.report.paper import TABLES
 
-#: One colour a class, in the order of `LABELS`; what is none of them is light grey.
-COLORS = ("#4c566a", "#c9b79c", "#e07a1f", "#3a7d44", "#2f6db5", "#7cc36e", "#b04fb0", "#d62839")
 #: Where each table is shown; table 6 is not in the paper.
 NOTEBOOKS = {
     1: "05_table1_zero_shot",
@@ -30,8 +21,6 @@ NOTEBOOKS = {
     5: "09_table5_data_generation",
     6: "09_table5_data_generation",
 }
-_NOTHING = "#ececec"
-_OUTSIDE = "#ffffff"
 
 # claims are sentences: a table shows them whole
 pd.set_option("display.max_colwidth", None)
@@ -91,101 +80,6 @@ def scoreboard(verdicts: Sequence[Verdict]) -> Markdown:
         link = f"[notebook {int(NOTEBOOKS[v.table][:2])}]({NOTEBOOKS[v.table]}.ipynb)"
         lines.append(f"| {v.id} | {v.claim} | {paper} | {ours} | {interval} | **{v.verdict}** | {link} |")
     return Markdown("\n".join(lines))
-
-
-def label_image(label: np.ndarray, fov: np.ndarray | None = None) -> np.ndarray:
-    """(H, W) labels -> (H, W, 3) colours; what lies outside `fov` is white."""
-    palette = np.array([*(_rgb(color) for color in COLORS), _rgb(_NOTHING)])
-    image = palette[label]
-    return image if fov is None else np.where(fov[..., None], image, _rgb(_OUTSIDE))
-
-
-def maps_image(maps: np.ndarray, fov: np.ndarray) -> np.ndarray:
-    """Predicted masks (8, M, M) -> (M, M, 3) colours; where masks overlap, the later class is drawn on top."""
-    label = np.full(maps.shape[1:], len(LABELS))
-    for index, mask in enumerate(maps):
-        if LABELS[index] != "floor":  # floor is below everything that stands on it
-            label = np.where(mask, index, label)
-    label = np.where((label == len(LABELS)) & maps[LABELS.index("floor")], LABELS.index("floor"), label)
-    return label_image(label, fov)
-
-
-def flat(masks: np.ndarray) -> np.ndarray:
-    """(K, H, W) bool as one picture, (H, W) in [0, 1]: each mask in a grey of its own, later ones on top."""
-    grey = np.linspace(0.4, 1, len(masks))[::-1] if len(masks) else np.zeros(0)
-    return np.max(masks * grey[:, None, None], axis=0, initial=0)
-
-
-def averages_figure(number: int, records: Sequence[Record]) -> Figure:
-    """Both averages of each row of a table: ours with 90 % intervals over scenes and seeds, the paper's as crosses."""
-    rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
-    figure, panels = plt.subplots(1, 2, figsize=(8, 0.9 + 0.28 * len(rows)), sharey=True)
-    for axes, (name, statistic) in zip(panels, {"class": class_iou, "pixel": pixel_iou}.items()):
-        for y, row in enumerate(rows):
-            counts = [record.counts for record in records if record.row == row]
-            low, high = bootstrap_interval(counts, statistic, np.random.default_rng(0))
-            mean = np.mean([one.value(statistic) for one in counts])
-            axes.plot([100 * low, 100 * high], [y, y], color=COLORS[4], linewidth=3, alpha=0.5)
-            axes.plot(100 * mean, y, "o", color=COLORS[4])
-            if (published := TABLES.get(number, {}).get(row)) is not None:
-                axes.plot(published.class_iou if name == "class" else published.pixel_iou, y, "x", color=COLORS[0])
-        axes.set(xlabel=f"{name} IoU [%]", xlim=(0, None))
-        axes.grid(axis="x", alpha=0.3)
-    panels[0].set_yticks(range(len(rows)), [f"({row})" for row in rows])
-    panels[0].invert_yaxis()
-    figure.tight_layout()
-    return figure
-
-
-def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarray], side: float = 1.2) -> Figure:
-    """Views of test homes, one a line: photograph, its labels, the maps of each row, and the truth.
-
-    views: as `zerobev.experiments.gallery.gallery` returns them
-    maps: row -> (N, 8, M, M) bool, as `RecordStore.maps` returns them
-    """
-    truth = [label_image(label, fov) for label, fov in zip(views["bev_label"], views["fov"])]
-    predicted = [
-        (f"({row})", [maps_image(m, fov) for m, fov in zip(masks, views["fov"])]) for row, masks in maps.items()
-    ]
-    labels = [label_image(label) for label in views["fpv_label"]]
-    figure = grid([("photograph", views["rgb"]), ("FPV labels", labels), *predicted, ("truth", truth)], side)
-    add_legend(figure)
-    return figure
-
-
-def grid(columns: Sequence[tuple[str, Collection[np.ndarray]]], side: float = 1.5) -> Figure:
-    """A figure of image columns, each with a title and one image a row; 2-D images are shown in grey."""
-    rows = len(columns[0][1])
-    figure, axes = plt.subplots(rows, len(columns), figsize=(side * len(columns), side * rows + 0.3), squeeze=False)
-    for j, (title, images) in enumerate(columns):
-        axes[0, j].set_title(title, fontsize=8)
-        for i, image in enumerate(images):
-            axes[i, j].imshow(image, cmap="gray", interpolation="nearest")
-            axes[i, j].set_axis_off()
-    figure.tight_layout(pad=0.3)
-    return figure
-
-
-def add_legend(figure: Figure) -> None:
-    """The eight classes and their colours, below a figure."""
-    patches = [Patch(color=color, label=name) for name, color in zip(LABELS, COLORS)]
-    figure.legend(handles=patches, loc="lower center", ncols=len(LABELS), fontsize=7, bbox_to_anchor=(0.5, -0.04))
-
-
-def _rgb(color: str) -> np.ndarray:
-    return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)], np.uint8)
-
-
-def plan(scene: Scene, cell_m: float = 0.05) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """The whole home from above: (M, M) int8 labels, and the `extent` in world metres for `imshow`."""
-    low, high = scene.vertices[:, :2].min(axis=0), scene.vertices[:, :2].max(axis=0)
-    side_m = float((high - low).max())
-    # a BEV camera large enough for the home, standing at the middle of its southern edge and looking north
-    camera = CameraConfig(fpv_px=1, bev_px=round(side_m / cell_m), bev_extent_m=side_m)
-    middle = float((low[0] + high[0]) / 2)
-    seen = RayCaster(scene).bev(Pose(middle, float(low[1]), float(scene.vertices[:, 2].min()), np.pi / 2), camera)
-    extent = (middle - side_m / 2, middle + side_m / 2, float(low[1]), float(low[1]) + side_m)
-    return scene.instance_label[seen.instance], extent
 
 
 class Checks:

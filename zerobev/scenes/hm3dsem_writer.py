@@ -12,10 +12,10 @@ import trimesh
 from PIL import Image
 
 from zerobev.common.errors import InputError
+from zerobev.common.storage import write_json
 from zerobev.scenes.glb import Primitive, placed_meshes, write_glb
 from zerobev.scenes.hm3dsem import FIRST_LINE, hash_of
 from zerobev.scenes.scene import Instance, Scene
-from zerobev.common.storage import write_json
 
 _CONFIG = "hm3d_annotated_basis.scene_dataset_config.json"
 _JPEG_QUALITY = 90

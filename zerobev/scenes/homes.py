@@ -11,9 +11,9 @@ import joblib
 import numpy as np
 
 from zerobev import config
-from zerobev.config import SceneConfig
 from zerobev.common.errors import run_command
 from zerobev.common.parallel import run_jobs
+from zerobev.config import SceneConfig
 from zerobev.scenes.hm3dsem import Split
 from zerobev.scenes.hm3dsem_writer import write_dataset_config, write_scene
 from zerobev.scenes.indoor import generate_home

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zerobev.config import LABELS, NO_LABEL
 from zerobev.common.errors import InputError
+from zerobev.config import LABELS, NO_LABEL
 from zerobev.scenes.scene import Instance
 
 

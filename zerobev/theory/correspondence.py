@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from zerobev.config import CameraConfig
-from zerobev.models.band_transformer import sinusoids
-from zerobev.models.fpv_to_bev import columns
 from zerobev.geometry.cameras import fpv_rays
 from zerobev.geometry.projection import map_points
+from zerobev.models.band_transformer import sinusoids
+from zerobev.models.fpv_to_bev import columns
 
 
 def positions(depth: Tensor, camera: CameraConfig) -> Tensor:

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
+from zerobev.data.samples import ViewOrder, ViewSet
+from zerobev.models.depth import DepthEstimator
 from zerobev.training.history import History
 from zerobev.training.losses import Losses
 from zerobev.training.train import train
-from zerobev.models.depth import DepthEstimator
-from zerobev.data.samples import ViewOrder, ViewSet
 
 Batch = Mapping[str, Tensor]
 _BATCH = 32  # photographs that are estimated together

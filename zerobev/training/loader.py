@@ -74,6 +74,11 @@ def batches(
         yield moved(batch, device)
 
 
+def model_inputs(batch: Batch) -> list[Tensor]:
+    """Arguments of a model's call: `rgb`, `zero`, and `depth` if the batch has it."""
+    return [batch[name] for name in ("rgb", "zero", "depth") if name in batch]
+
+
 def moved(batch: Batch, device: torch.device) -> Batch:
     """The batch on the device."""
     return {name: value.to(device, non_blocking=True) for name, value in batch.items()}

@@ -6,8 +6,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, distributed
 
-from zerobev.config import AUX
 from zerobev.common.errors import InputError
+from zerobev.config import AUX
 
 EPSILON = 1e-6  #: keeps the Dice ratio of an empty class finite
 

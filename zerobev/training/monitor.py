@@ -7,8 +7,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from zerobev.evaluation.evaluate import model_inputs
 from zerobev.common.storage import replacing
+from zerobev.training.loader import model_inputs
 
 _SHOWN = 4  # samples of a batch
 

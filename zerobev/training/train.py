@@ -27,17 +27,16 @@ from matplotlib.figure import Figure
 from safetensors.torch import save_model
 from torch import Tensor, nn
 
-from zerobev.config import AUX, TrainConfig
 from zerobev.common.errors import InputError
-from zerobev.evaluation.evaluate import model_inputs
+from zerobev.common.progress import progress
+from zerobev.common.storage import replacing
+from zerobev.config import AUX, TrainConfig
 from zerobev.training.history import Entry, History, columns
-from zerobev.training.loader import Batch, Source, batches, moved
+from zerobev.training.loader import Batch, Source, batches, model_inputs, moved
 from zerobev.training.losses import Losses, zero_bev_loss
 from zerobev.training.monitor import curves_figure, write_picture
 from zerobev.training.precision import computes_bfloat16
 from zerobev.training.schedule import Schedule
-from zerobev.common.progress import progress
-from zerobev.common.storage import replacing
 
 CHECKPOINT_SECONDS = 60  #: between two checkpoints, beside those at validations
 HISTORY_ENTRIES = 1000  #: about as many are kept of a run, beside those at validations
