@@ -47,8 +47,8 @@ def _one_less(match: re.Match[str]) -> str:
     return match[0][:-1] + str((int(match[0][-1]) - 1) % 10)
 
 
-_RECORDS = ("tests/test_trust.py::test_records_are_as_they_were_written",)
-_RUNS = "tests/test_runs.py::"
+_RECORDS = ("tests/integrity/test_trust.py::test_records_are_as_they_were_written",)
+_RUNS = "tests/unit/experiments/test_runs.py::"
 
 MUTATIONS = (
     # numbers
@@ -71,14 +71,14 @@ MUTATIONS = (
         "zerobev/report/paper.py",
         re.compile(r'(\("b\.1", "VPN[^"]*", )("[^"]*")(\),\s*\("b\.2", "TIM[^"]*", )("[^"]*")'),
         r"\1\4\3\2",
-        ("tests/test_claims.py::test_every_claim_names_rows_of_its_table_and_holds_in_the_paper",),
+        ("tests/unit/report/test_claims.py::test_every_claim_names_rows_of_its_table_and_holds_in_the_paper",),
     ),
     Mutation(
         "two published rows of Table 4 swapped",
         "zerobev/report/paper.py",
         re.compile(r'(\("c\.10", "[^"]*", )("[^"]*")(\),\s*\("c\.15", "[^"]*", )("[^"]*")'),
         r"\1\4\3\2",
-        ("tests/test_trust.py::test_published_numbers_are_those_that_were_checked",),
+        ("tests/integrity/test_trust.py::test_published_numbers_are_those_that_were_checked",),
     ),
     # axes of the map
     Mutation(
@@ -86,28 +86,28 @@ MUTATIONS = (
         "zerobev/geometry/cameras.py",
         "across[::-1])",
         "across)",
-        ("tests/test_cameras.py",),
+        ("tests/unit/geometry/test_cameras.py",),
     ),
     Mutation(
         "cells left and right exchanged",
         "zerobev/geometry/cameras.py",
         "np.meshgrid(across - camera.bev_extent_m / 2,",
         "np.meshgrid(camera.bev_extent_m / 2 - across,",
-        ("tests/test_cameras.py",),
+        ("tests/unit/geometry/test_cameras.py",),
     ),
     Mutation(
         "projection far and near exchanged",
         "zerobev/geometry/projection.py",
         "row = side - 1 - torch.floor(y / camera.cell_m).long()",
         "row = torch.floor(y / camera.cell_m).long()",
-        ("tests/test_projection.py",),
+        ("tests/unit/geometry/test_projection.py",),
     ),
     Mutation(
         "projection left and right exchanged",
         "zerobev/geometry/projection.py",
         "torch.floor((x + camera.bev_extent_m / 2)",
         "torch.floor((camera.bev_extent_m / 2 - x)",
-        ("tests/test_projection.py",),
+        ("tests/unit/geometry/test_projection.py",),
     ),
     # the zero-shot stream
     Mutation(
@@ -115,28 +115,28 @@ MUTATIONS = (
         "zerobev/data/samples.py",
         '"zero": zero.astype(np.float32)',
         '"zero": np.roll(zero, 1, axis=-1).astype(np.float32)',
-        ("tests/test_tuples.py",),
+        ("tests/unit/data/test_samples.py",),
     ),
     Mutation(
         "textures a pixel down",
         "zerobev/data/samples.py",
         "[image.reshape(-1, 3) for image in texels]",
         "[np.roll(image, i == 0, 0).reshape(-1, 3) for i, image in enumerate(texels)]",
-        ("tests/test_tuples.py",),
+        ("tests/unit/data/test_samples.py",),
     ),
     Mutation(
         "what is raised painted by the camera's place alone",
         "zerobev/data/samples.py",
         "(x * right + y * forward + view.pose[axis])",
         "(x * (axis == 0) + y * (axis == 1) + view.pose[axis])",
-        ("tests/test_tuples.py",),
+        ("tests/unit/data/test_samples.py",),
     ),
     Mutation(
         "a batch where a share of it was asked for",
         "zerobev/training/loader.py",
         "self._source.batch(step, *self._place)",
         "self._source.batch(step)",
-        ("tests/test_loader.py",),
+        ("tests/unit/training/test_loader.py",),
     ),
     # splits
     Mutation(
@@ -174,7 +174,7 @@ MUTATIONS = (
         "zerobev/theory/attention.py",
         "return self.attention(features) @ values\n",
         "return self.aux(features, values)\n",
-        ("tests/test_theory.py::test_cross_attention_is_the_scaled_dot_product",),
+        ("tests/unit/theory/test_theory.py::test_cross_attention_is_the_scaled_dot_product",),
     ),
     # speed and memory
     Mutation(
@@ -182,14 +182,14 @@ MUTATIONS = (
         "zerobev/data/shards.py",
         "h5py.File(self.path, rdcc_nbytes=0)",
         "h5py.File(self.path)",
-        ("tests/test_shards.py::test_what_was_read_is_not_kept",),
+        ("tests/unit/data/test_shards.py::test_what_was_read_is_not_kept",),
     ),
     Mutation(
         "a benchmark of earlier code",
         "zerobev/benchmarks/run.py",
         re.compile(r"_VERSION = \d+"),
         lambda match: f"{match[0]}0",
-        ("tests/test_trust.py::test_what_is_measured_once_was_measured_by_this_code",),
+        ("tests/integrity/test_trust.py::test_what_is_measured_once_was_measured_by_this_code",),
     ),
 )
 

@@ -148,7 +148,7 @@ class Scale:
     #: share of the *Synth* samples in which all that is raised is painted from above (not in the paper)
     upright: float = 0.0
     test_views: int | None = None  #: of each test scene, the first ones, that networks are evaluated on; None: all
-    #: first weights of the RGB backbones, as `models.backbone_weights.load_backbone` takes them; empty: the depth estimator's
+    #: first weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
     backbone: str = ""
     vpn_backbone: str = ""
 

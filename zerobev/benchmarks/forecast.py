@@ -1,4 +1,4 @@
-"""What a reproduction takes on this machine, before it begins: `python -m zerobev.benchmarks.forecast --scale S [--scenes DIR]`.
+"""Forecast of the time, memory and disk that a reproduction takes on this machine.
 
 Views of one home and samples of two trainings are measured, in about a minute; the rest is multiplication. These are
 estimates, for one process and one device: every network costs what that of row (c) does, and figures come on top.

@@ -1,7 +1,6 @@
 """The one way to get a run's record: read it, or compute it.
 
-As a command, one row: `python -m zerobev.experiments.runs --scale S --row R --seed N [--scenes DIR] [--dask ADDRESS]`. It is what
-`accelerate launch` starts on several GPUs: the processes share training and evaluation, the first one writes.
+Under `accelerate launch` the processes share training and evaluation, and the first one writes.
 """
 
 import argparse

@@ -124,7 +124,7 @@ class Projector:
 def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None) -> Projector:
     """A projector, from weights that ship with the package or from a checkpoint of your own.
 
-    source: a shipped row (`zerobev.inference.shipped_weights.ROWS`), "a.2" for the projection P^-1, or the path of a checkpoint
+    source: a shipped row (`shipped_weights.ROWS`), "a.2" for the projection P^-1, or the path of a checkpoint
     estimator: of metric depth, for the field of view, P^-1 and residual networks; default: the one that ships
     Raises `InputError` for an unknown row, a file that is no network for zero-shot projection, and where the shipped
     depth estimator does not fit the network's camera.

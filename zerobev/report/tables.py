@@ -29,8 +29,8 @@ pd.set_option("display.max_colwidth", None)
 def table(number: int, records: Sequence[Record]) -> pd.DataFrame:
     """A table of the paper, its rows above ours, IoU in percent; ours are means over the records' seeds.
 
-    Rows of `zerobev.report.own_rows` follow. Rows of which there is no record are shown with the paper's numbers alone, so that
-    what is missing is seen.
+    Rows of `report.own_rows` follow. Rows without a record are shown with the paper's numbers alone, so that missing
+    ones are seen.
     """
     lines = []
     for letter, method in rows_of(number).items():

@@ -1,0 +1,43 @@
+"""What is seen without running: style, types, what may be loaded, and files that are read in one sitting."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from support.paths import ROOT
+
+SOURCES = sorted((ROOT / "zerobev").rglob("*.py"))
+#: Of a file. The longest are one idea each: a training loop, the arranging of rooms, texture banks.
+MOST_LINES = 340
+
+
+@pytest.mark.parametrize("command", ["ruff check .", "ruff format --check .", "mypy"])
+def test_the_checkers_find_nothing(command: str):
+    """Their settings are in pyproject.toml."""
+    found = subprocess.run([sys.executable, "-m", *command.split()], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_file_is_read_in_one_sitting(path: Path):
+    assert len(path.read_text().splitlines()) <= MOST_LINES
+
+
+def unsafe_loads(source: str) -> list[str]:
+    """Calls that would run what a file says. Ruff's S301 finds pickle itself."""
+    calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+    said = [(ast.unparse(call.func), {ast.unparse(word) for word in call.keywords}) for call in calls]
+    return [
+        name
+        for name, words in said
+        if "allow_pickle=True" in words or (name == "torch.load" and "weights_only=True" not in words)
+    ]
+
+
+def test_only_data_is_loaded():
+    assert unsafe_loads("torch.load(f, weights_only=True); np.load(f)") == []
+    assert unsafe_loads("torch.load(f); np.load(f, allow_pickle=True)") == ["torch.load", "np.load"]
+    assert [(path, call) for path in SOURCES for call in unsafe_loads(path.read_text())] == []

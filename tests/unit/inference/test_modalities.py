@@ -1,0 +1,342 @@
+"""Modalities as binary images and back: resampling against a closed form, boxes and flow by hand, objects that move."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from transformers import YolosConfig, YolosForObjectDetection
+
+from zerobev.common.errors import InputError
+from zerobev.config import CameraConfig
+from zerobev.evaluation.motion import MovingPair, arrow_errors, motion_table, moving_pair, true_flow
+from zerobev.geometry.cameras import Pose
+from zerobev.inference import BevMap, Boxes, Flow, HubDetector, Projector
+from zerobev.inference.boxes import rendered_boxes
+from zerobev.inference.flow import flow_field
+from zerobev.inference.images import LEVELS, binary_images
+from zerobev.inference.pinhole import PinholeView
+from zerobev.rendering.gbuffer import RayCaster
+from zerobev.rendering.photograph import Photographer
+from zerobev.scenes.moving import movable, moved
+
+from support.scenes import box, build, furnished, room
+
+CAMERA = CameraConfig(fpv_px=64, bev_px=40)
+
+
+# --- resampling to the network's camera ---------------------------------------------------------------------------
+
+
+def scene_of_rays(width: int, height: int, hfov_deg: float) -> np.ndarray:
+    """What a pinhole camera sees of a world whose colour is an affine function of the ray, (H, W, 3)."""
+    focal = width / 2 / np.tan(np.radians(hfov_deg) / 2)
+    x, y = np.meshgrid(*((np.arange(length) + 0.5 - length / 2) / focal for length in (width, height)))
+    return np.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 + 0.1 * (x - y)], axis=-1)
+
+
+@pytest.mark.parametrize(("width", "height", "hfov"), [(64, 64, 79), (640, 480, 95), (301, 233, 60), (90, 200, 79)])
+def test_a_photograph_of_any_camera_is_what_the_network_s_camera_would_see(width, height, hfov):
+    view = PinholeView((height, width), hfov, CAMERA)
+    expected = scene_of_rays(64, 64, 79)
+    # a pixel counts as covered from its middle on
+    focal = width / 2 / np.tan(np.radians(hfov) / 2)
+    ray = np.abs((np.arange(64) + 0.5 - 32) / CAMERA.focal_px)
+    covered = (ray[:, None] <= height / 2 / focal + 1e-9) & (ray <= width / 2 / focal + 1e-9)
+    np.testing.assert_array_equal(view.covered, covered)
+    photograph = view.photograph(scene_of_rays(width, height, hfov))
+    rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
+    clipped = np.ix_(np.clip(range(64), rows[0], rows[-1]), np.clip(range(64), columns[0], columns[-1]))
+    assert photograph.dtype == np.float32
+    np.testing.assert_array_equal(photograph, photograph[clipped])  # beyond the border its colours go on
+    # a pixel of the smaller of the two is what the border may be off by
+    slack = 0.3 * max(1 / CAMERA.focal_px, 1 / focal)
+    assert np.abs(photograph - expected)[covered].max() < slack
+    inner = covered & np.roll(covered, (1, 1), (0, 1)) & np.roll(covered, (-1, -1), (0, 1))
+    assert np.abs(photograph - expected)[inner].mean() < 0.1 * slack
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5))
+def test_whole_factors_are_exact(seed, factor):
+    small = np.random.default_rng(seed).random((64, 64)) < 0.3
+    rgb = np.random.default_rng(seed).random((64, 64, 3)).astype(np.float32)
+    large, large_rgb = (np.repeat(np.repeat(image, factor, 0), factor, 1) for image in (small, rgb))
+    view = PinholeView(large.shape, 79, CAMERA)
+    np.testing.assert_array_equal(view.mask(large), small)
+    np.testing.assert_allclose(view.photograph(large_rgb), rgb, atol=1e-5)
+
+
+@given(st.integers(0, 630), st.booleans())
+def test_a_line_of_half_a_pixel_survives_wherever_it_lies_and_nothing_in_view_gets_lost(place, upright):
+    view = PinholeView((640, 640), 79, CAMERA)
+    for width, least in ((5, 64), (1, 1)):
+        image = np.zeros((640, 640), bool)
+        image[:, place : place + width] = True
+        found = view.mask(image if upright else image.T)
+        assert found.sum() >= least and (found if upright else found.T).all(axis=0).any()
+    assert not view.mask(np.zeros((640, 640), bool)).any()
+
+
+def test_edges_grow_by_a_quarter_of_a_pixel():
+    view = PinholeView((640, 640), 79, CAMERA)
+    grown = []
+    for left in range(200, 210):
+        image = np.zeros((640, 640), bool)
+        image[:, left:500] = True
+        grown.append(view.mask(image)[0].sum() * 10 - image[0].sum())
+    assert 1 < np.mean(grown) < 4  # tenths of a pixel
+
+
+@pytest.mark.parametrize("hfov", [0, 180, -3, float("nan"), 0.1])
+def test_a_field_of_view_that_is_none_is_refused(hfov):
+    with pytest.raises(InputError, match=r"hfov_deg: expected"):
+        PinholeView((48, 48), hfov, CAMERA)
+
+
+# --- arrays -------------------------------------------------------------------------------------------------------
+
+
+def test_labels_become_masks_and_values_their_level_sets():
+    labels = np.array([[2, 2, -1], [0, 7, 7]])
+    images = binary_images(labels, (2, 3), {0: "wall", 2: "bed", 7: "tv"})
+    assert images.labels == ("wall", "bed", "tv") and images.levels == 1
+    np.testing.assert_array_equal(np.stack(list(images.images)), np.stack([labels == k for k in (0, 2, 7)]))
+    values = np.linspace(0, 1, 6).reshape(2, 3).astype(np.float32)
+    images = binary_images(values, (2, 3))
+    assert images.levels == LEVELS and images.labels == ("0",)
+    assert np.abs(np.mean(list(images.images), axis=0) - values).max() <= 0.5 / LEVELS + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("modality", "message"),
+    [
+        (np.zeros((3, 4), bool), r"expected \(2, 3\) or \(K, 2, 3\) of bool, found \(3, 4\)"),
+        (np.zeros((0, 2, 3), bool), r"found \(0, 2, 3\)"),
+        (np.zeros((2, 2, 3), int), r"expected \(2, 3\) of int64, found .*a stack of masks has to be bool"),
+        (np.full((2, 3), -1), r"expected 1 to 256 labels from 0 up, found 0"),
+        (np.full((2, 3), np.nan), r"found NaN or infinity"),
+        (np.full((2, 3), 1.5), r"expected values in \[0, 1\], found 1.5 to 1.5"),
+        (np.array([["a"] * 3] * 2), r"expected an array of bool, integers or floating point, found <U1"),
+        (None, r"found object"),
+    ],
+)
+def test_arrays_that_mean_nothing_are_refused(modality, message):
+    with pytest.raises(InputError, match=f"^modality: .*{message}"):
+        binary_images(np.asarray(modality), (2, 3))
+
+
+def test_a_label_without_a_name_is_refused():
+    with pytest.raises(InputError, match=r"names: .*KeyError\(5\)"):
+        binary_images(np.full((2, 3), 5), (2, 3), {0: "wall"})
+
+
+# --- boxes --------------------------------------------------------------------------------------------------------
+
+
+def test_boxes_are_filled_between_their_corners(tmp_path):
+    (tmp_path / "boxes.csv").write_text("label,score,xmin,ymin,xmax,ymax\nchair,0.75,1,0,3,2\nplant,0.5,-2,2.6,1,9\n")
+    boxes = Boxes.read_csv(tmp_path / "boxes.csv")
+    images = boxes.images((4, 5))
+    chair, plant = images.images
+    assert images.labels == ("chair", "plant") and images.scores.tolist() == [0.75, 0.5]
+    assert np.argwhere(chair).tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
+    assert np.argwhere(plant).tolist() == [[3, 0]]
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"xmin": [1]}, r"expected columns xmin, ymin, xmax, ymax, label, found xmin"),
+        ({"xmin": [3], "ymin": [0], "xmax": [3], "ymax": [2], "label": ["a"]}, r"xmin < xmax and ymin < ymax in box 0"),
+        ({"xmin": [np.nan], "ymin": [0], "xmax": [3], "ymax": [2], "label": ["a"]}, r"in box 0, found nan"),
+        ({"xmin": ["x"], "ymin": [0], "xmax": [3], "ymax": [2], "label": ["a"]}, r"expected numbers"),
+        ({"xmin": [1], "ymin": [0], "xmax": [3], "ymax": [2], "label": ["a"], "score": [2]}, r"scores in \[0, 1\]"),
+    ],
+)
+def test_tables_that_are_none_of_boxes_are_refused(table, message):
+    with pytest.raises(InputError, match=message):
+        Boxes.from_table(pd.DataFrame(table))
+
+
+def test_rendered_boxes_enclose_their_instances_until_they_are_spoilt():
+    instance = np.zeros((40, 50), int)
+    instance[5:15, 10:30], instance[20:40, 0:9], instance[0, 0] = 3, 4, 5
+    names = {3: "bed", 4: "chair", 5: "tv"}
+    exact = rendered_boxes(instance, names, np.random.default_rng(0), jitter=0, misses=0)
+    assert exact.labels == ("bed", "chair") and exact.corners.tolist() == [[10, 5, 30, 15], [0, 20, 9, 40]]
+    assert exact.scores.tolist() == [1, 1] and "rendered" in exact.source
+    rng = np.random.default_rng(1)
+    spoilt = [rendered_boxes(instance, {3: "bed"}, rng, jitter=0.1, misses=0.25) for _ in range(400)]
+    corners = np.concatenate([boxes.corners for boxes in spoilt])
+    assert len(corners) == pytest.approx(300, abs=30)
+    np.testing.assert_allclose(corners.std(axis=0), [2, 1, 2, 1], rtol=0.15)
+    scores = np.concatenate([boxes.scores for boxes in spoilt])
+    assert 0.5 < scores.mean() < 0.95 and scores.max() <= 1
+
+
+def test_a_detector_from_a_folder_gives_boxes_in_pixels_of_the_photograph(tmp_path):
+    torch.manual_seed(0)
+    network = YolosForObjectDetection(
+        YolosConfig(
+            hidden_size=16,
+            num_hidden_layers=1,
+            num_attention_heads=2,
+            intermediate_size=16,
+            image_size=[32, 48],
+            patch_size=16,
+            num_detection_tokens=5,
+            id2label={0: "chair", 1: "plant", 2: "tv"},
+        )
+    ).eval()
+    network.save_pretrained(tmp_path)
+    settings = {"image_processor_type": "YolosImageProcessor", "size": {"height": 32, "width": 48}, "do_pad": False}
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(settings))
+    rgb = np.random.default_rng(0).integers(0, 256, (64, 96, 3), dtype=np.uint8)
+    seen = []
+    detector = HubDetector.from_pretrained(tmp_path)
+    detector._network.register_forward_hook(lambda module, args, outputs: seen.append(outputs))
+    boxes = detector.detect(rgb, least_score=0.0)
+    probability = seen[0].logits[0].softmax(-1)[:, :-1]
+    x, y, width, height = seen[0].pred_boxes[0].numpy().T
+    expected = np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1) * [96, 64, 96, 64]
+    np.testing.assert_allclose(boxes.corners, expected, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(boxes.scores, probability.max(-1).values, rtol=1e-5)
+    assert boxes.labels == tuple(("chair", "plant", "tv")[k] for k in probability.argmax(-1)) and len(boxes.labels) == 5
+    assert detector.detect(rgb, least_score=0.999).labels == ()
+    with pytest.raises(InputError, match="expected an object detector"):
+        HubDetector.from_pretrained(tmp_path / "nothing")
+
+
+# --- flow ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["tvl1", "ilk"])
+def test_flow_points_from_the_first_frame_to_the_second(method):
+    y, x = np.mgrid[:64, :64]
+    frames = [np.sin(0.3 * (x - dx))[..., None] * np.cos(0.23 * (y - dy))[..., None] for dx, dy in ((0, 0), (2, 1))]
+    first, second = (np.repeat(0.5 + 0.5 * frame, 3, axis=2) for frame in frames)
+    field = flow_field(first, second, method)
+    assert np.median(field[10:-10, 10:-10], axis=(0, 1)) == pytest.approx([2, 1], abs=0.3)
+
+
+def test_vectors_are_on_a_grid_where_something_moves():
+    field = np.zeros((40, 60, 2), np.float32)
+    field[10:20, 30:50] = (4, -3)
+    flow = Flow.of(field, spacing_px=5)
+    assert len(flow.start_px) == 8
+    np.testing.assert_allclose(flow.end_px - flow.start_px, np.tile([4, -3], (8, 1)))
+    columns, rows = np.floor(flow.start_px).astype(int).T
+    assert (field[rows, columns] == (4, -3)).all()
+    starts, ends = (np.stack(list(images.images)) for images in flow.discs((40, 60)))
+    for discs, points in ((starts, flow.start_px), (ends, flow.end_px)):
+        centres = [np.argwhere(disc).mean(axis=0)[::-1] + 0.5 for disc in discs]
+        np.testing.assert_allclose(centres, points, atol=0.3)
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        (np.zeros((4, 4)), r"expected floating point \(H, W, 2\), found float64 \(4, 4\)"),
+        (np.zeros((4, 4, 2), int), r"found int64"),
+        (np.full((4, 4, 2), np.nan), r"NaN"),
+        (np.zeros((4, 4, 2)), r"expected a vector of 1 px at least, found none"),
+    ],
+)
+def test_fields_without_flow_are_refused(field, message):
+    with pytest.raises(InputError, match=f"flow: .*{message}"):
+        Flow.of(field)
+
+
+# --- maps ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_map_knows_its_metres(tmp_path):
+    values = np.zeros((3, 40, 40), np.float32)
+    values[0, 8:12, 20:24] = 0.9  # 0 to 0.5 m right, 3.5 to 4 m forward
+    values[1, 39, 0] = 0.2
+    fov = np.ones((40, 40), bool)
+    fov[8, 20] = False
+    bev = BevMap(values, ("a", "b", "c"), values, fov, CAMERA, np.array([0.5, 0.6, 0.7]))
+    assert bev.extent == (-2.5, 2.5, 0.0, 5.0) and bev.cell_m == 0.125
+    table = bev.footprints()
+    assert table["area_m2"].tolist() == pytest.approx([15 * 0.125**2, 0, 0])
+    assert bev.centres_m[0] == pytest.approx([0.25 + 0.1875 / 15, 3.75 - 0.1875 / 15])
+    assert bev.centres_m[1] == pytest.approx([-2.4375, 0.0625])  # seen although no map shows it
+    assert np.isnan(bev.centres_m[2]).all()
+    bev.save(tmp_path / "map.npz")
+    with np.load(tmp_path / "map.npz") as file:
+        np.testing.assert_array_equal(file["maps"], bev.maps)
+        assert file["maps"].sum() == 15 and file["labels"].tolist() == ["a", "b", "c"]
+        assert file["extent"].tolist() == [-2.5, 2.5, 0, 5] and file["scores"].tolist() == [0.5, 0.6, 0.7]
+    axes = bev.show()
+    assert axes.get_images()[0].get_extent() == [-2.5, 2.5, 0, 5] and "[m]" in axes.get_xlabel()
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["a 0.50", "b 0.60"]
+    assert axes.lines[0].get_xydata()[0] == pytest.approx([-2.4375, 0.0625])
+
+
+# --- objects that move --------------------------------------------------------------------------------------------
+
+
+def test_a_moved_object_is_seen_elsewhere_by_all_sensors_and_nothing_else_changes():
+    scene = build(furnished())
+    chair = next(i.id for i in scene.instances if i.name == "chair")
+    assert chair in movable(scene)
+    after = moved(scene, chair, np.array([-0.25, -0.5, 0.0]))
+    pose = Pose(2.5, 0.1, 0.0, np.pi / 2)  # looks along +y, so that map and world axes agree
+    before_map, after_map = (RayCaster(one).bev(pose, CAMERA).instance == chair for one in (scene, after))
+    assert before_map.sum() == 16
+    np.testing.assert_array_equal(after_map, np.roll(before_map, (4, -2), (0, 1)))  # 50 cm nearer, 25 cm to the left
+    cast = RayCaster(after).fpv(pose, CAMERA)
+    here = cast.instance == chair
+    agree = [np.abs(Photographer(one, CAMERA).depth(pose)[::2, ::2] - cast.distance) < 0.1 for one in (after, scene)]
+    assert agree[0].mean() > 0.97 and agree[0][here].mean() > 0.8 and agree[1][here].mean() < 0.2
+    with pytest.raises(InputError, match="one mesh"):
+        moved(replace(scene, vertices=scene.vertices + np.float32(0.5)), chair, np.zeros(3))
+
+
+def test_true_flow_by_hand():
+    camera = CameraConfig(fpv_px=100, bev_px=40, hfov_deg=90)
+    points = np.array([[[1.0, 2.0, 0.88], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]])  # the last one is nothing
+    flow = true_flow(points, np.array([0.0, -1.0, 0.0]), camera)
+    assert flow[0].tolist() == [[pytest.approx(25), 0], [0, pytest.approx(22)], [0, 0]]
+
+
+def pair_of_a_moving_box(seed: int) -> tuple[MovingPair, tuple[int, int, int]]:
+    things = [*room((5, 4, 2.5)), box("chair", (2.2, 1.9, 0), (2.8, 2.5, 0.8))]
+    scene = build(things)
+    return moving_pair(scene, CAMERA, np.random.default_rng(seed)), scene.instances[-1].color
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_true_flow_leads_to_the_object_in_the_second_photograph(seed):
+    pair, color = pair_of_a_moving_box(seed)
+    rows, columns = np.nonzero(pair.on_object)
+    assert np.mean(np.abs(pair.first[rows, columns].astype(int) - color).max(axis=-1) < 12) > 0.95
+    ends = np.round(np.stack([columns, rows], axis=1) + pair.flow_px[rows, columns]).astype(int)
+    inside = ((ends >= 0) & (ends < 256)).all(axis=1)
+    colors = pair.second[ends[inside, 1], ends[inside, 0]].astype(int)
+    assert inside.mean() > 0.3 and np.mean(np.abs(colors - color).max(axis=-1) < 12) > 0.85
+    assert not pair.flow_px[~pair.on_object].any() and 0.2 <= np.linalg.norm(pair.motion_m) <= 0.6
+
+
+def test_arrows_are_as_wrong_as_the_depth_they_come_from():
+    pair, _ = pair_of_a_moving_box(0)
+    depth = torch.from_numpy(np.where(pair.on_object, pair.point_m[..., 1], 0).astype(np.float32))
+    coarse = depth[2::4, 2::4][None, None]  # the first frame's, for both: the end falls off the object
+    errors = arrow_errors(Projector("a.1", CAMERA, None, lambda rgb: coarse), pair, pair.flow_px)
+    assert errors["start"].median() < 0.15
+    doubled = arrow_errors(Projector("a.1", CAMERA, None, lambda rgb: coarse * 1.5), pair, pair.flow_px)
+    assert doubled["start"].median() > 3 * errors["start"].median()
+    assert arrow_errors(Projector("a.1", CAMERA, None, lambda rgb: coarse), pair, 0 * pair.flow_px) is None
+
+
+def test_the_table_of_motion_holds_means_over_pairs():
+    lines = [(k, "true", "d", 10, 0.1, 0.1 * k, 0.2 * k, 0.3) for k in range(5)]
+    names = ["pair", "flow", "row", "vectors", "missing", "start", "end", "motion"]
+    line = motion_table(pd.DataFrame(lines, columns=names)).loc[("true", "d")]
+    assert line["pairs"] == 5 and line["vectors"] == 50 and line["missing"] == 0.1
+    assert line["start [m]"].startswith("0.20 [0.") and line["motion [m]"] == "0.30"

@@ -1,0 +1,278 @@
+"""`zerobev.load().project`: against the networks it wraps, against a closed form, and as a command."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors import safe_open
+
+import zerobev
+from zerobev.common.errors import InputError, run_command
+from zerobev.config import SCALES, CameraConfig
+from zerobev.experiments.depth_pretraining import DepthPretraining
+from zerobev.experiments.release import SCALE, halve, runs
+from zerobev.experiments.workspace import Workspace
+from zerobev.geometry.projection import project
+from zerobev.inference.images import LEVELS
+from zerobev.inference.project import main, read_labels, read_mask, read_photograph
+from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS, run_of, shipped
+from zerobev.models import build, load_model
+from zerobev.models.depth import DepthNet
+
+from support.paths import ROOT
+
+SIDE = SCALES[SCALE].camera.fpv_px
+CAMERA = CameraConfig(fpv_px=SIDE, bev_px=40)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def models() -> dict[str, zerobev.Projector]:
+    return {row: zerobev.load(row) for row in ("a.2", *ROWS)}
+
+
+@pytest.fixture(scope="module")
+def rgb() -> np.ndarray:
+    """A floor, a wall, and a dark thing between them."""
+    image = np.full((SIDE, SIDE, 3), (200, 190, 170), np.uint8)
+    image[SIDE // 2 + 8 :] = (120, 90, 60)
+    image[SIDE // 2 - 4 : SIDE // 2 + 14, 20:40] = (40, 50, 60)
+    return image
+
+
+@pytest.fixture(scope="module")
+def masks() -> np.ndarray:
+    images = np.zeros((3, SIDE, SIDE), bool)
+    images[0, SIDE // 2 + 8 :] = True
+    images[1, SIDE // 2 - 4 : SIDE // 2 + 14, 20:40] = True
+    return images  # the last one is empty
+
+
+def flat(depth_m: float) -> zerobev.Projector:
+    """P^-1 with the same depth everywhere."""
+    return zerobev.Projector("a.2", CAMERA, None, lambda rgb: torch.full((1, 1, SIDE, SIDE), depth_m))
+
+
+def test_the_package_is_light_until_it_is_used():
+    code = "import sys, zerobev; assert 'torch' not in sys.modules; assert zerobev.load and 'torch' in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+    with pytest.raises(AttributeError, match="no attribute 'unload'"):
+        _ = zerobev.unload
+
+
+# --- the weights that ship ----------------------------------------------------------------------------------------
+
+
+def test_the_weights_are_small_and_come_from_the_recorded_runs():
+    files = {path.stem: path for path in FOLDER.glob("*")}
+    assert set(files) == {*ROWS, DEPTH} and sum(path.stat().st_size for path in files.values()) < 12e6
+    assert {name: run_of(path) for name, path in files.items()} == runs()
+    for row in ROWS:
+        assert (ROOT / "reports" / SCALE / "records" / f"{run_of(files[row])}.json").exists()
+    assert json.loads((ROOT / "reports" / SCALE / "depth.json").read_text())["key"] == run_of(files[DEPTH])
+
+
+def test_half_precision_rounds_and_nothing_else():
+    recorded = DepthNet.load(DepthPretraining(Workspace(SCALE)).weights).state_dict()
+    for name, tensor in DepthNet.load(shipped(DEPTH)).state_dict().items():
+        assert tensor.dtype == recorded[name].dtype
+        torch.testing.assert_close(tensor, recorded[name], rtol=2**-10, atol=1e-7)
+
+
+def test_weights_beyond_half_precision_are_refused(tmp_path):
+    torch.manual_seed(0)
+    model = build("c", SCALES["smoke"].camera, SCALES["smoke"].model)
+    model.save(tmp_path / "whole.safetensors")
+    halve(tmp_path / "whole.safetensors", tmp_path / "half.safetensors", "run-7")
+    assert run_of(tmp_path / "half.safetensors") == "run-7"
+    again = load_model(tmp_path / "half.safetensors").state_dict()
+    assert all(torch.equal(again[k], t.half().to(t.dtype)) for k, t in model.state_dict().items())
+    with safe_open(tmp_path / "half.safetensors", framework="pt") as file:
+        assert {file.get_tensor(name).dtype for name in file.keys()} == {torch.float16, torch.int64}  # noqa: SIM118
+    with torch.no_grad():
+        next(iter(model.parameters()))[0] = 1e6
+    model.save(tmp_path / "whole.safetensors")
+    with pytest.raises(InputError, match="expected weights within half precision"):
+        halve(tmp_path / "whole.safetensors", tmp_path / "half.safetensors", "run-7")
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [("z", "source: expected one of a.2, c, .*found 'z'"), (shipped(DEPTH), "expected a zero-shot network")],
+)
+def test_what_is_no_zero_shot_network_is_not_loaded(source, message):
+    with pytest.raises(InputError, match=message):
+        zerobev.load(source)
+
+
+def test_a_network_of_another_camera_needs_its_own_depth(tmp_path):
+    smoke = SCALES["smoke"]
+    build("c", smoke.camera, smoke.model).save(tmp_path / "own.safetensors")
+    with pytest.raises(InputError, match="estimator: expected a depth estimator for images of 32 px"):
+        zerobev.load(tmp_path / "own.safetensors")
+    own = zerobev.load(tmp_path / "own.safetensors", DepthNet(smoke.camera, smoke.model).eval())
+    assert own.project(np.zeros((50, 60, 3)), np.ones((50, 60), bool)).maps.shape == (1, 20, 20)
+
+
+# --- projection ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_a_projector_is_its_network(row, models, rgb, masks):
+    bev = models[row].project(rgb, masks, names=["floor", "thing", "nothing"])
+    batch = torch.from_numpy(rgb / np.float32(255)).permute(2, 0, 1)[None]
+    with torch.inference_mode():
+        depth = DepthNet.load(shipped(DEPTH))(batch)
+        logits = load_model(shipped(row))(batch, torch.from_numpy(masks).float()[None], depth).zero_logits[0]
+    np.testing.assert_allclose(bev.values[:2], logits[:2].sigmoid(), atol=1e-4)
+    np.testing.assert_allclose(bev.evidence[:2], (logits[:2] - logits[2]).clamp(min=0), atol=1e-3)
+    assert not bev.values[2].any() and not bev.maps[2].any()  # empty, whatever the network makes of it
+    assert bev.labels == ("floor", "thing", "nothing") and bev.maps[0].any()
+    assert not (bev.maps & ~bev.fov).any()
+
+
+@pytest.mark.parametrize("row", ["a.2", *ROWS])
+def test_size_and_type_of_the_photograph_do_not_matter(row, models, rgb, masks):
+    bev = models[row].project(rgb, masks)
+    large = np.repeat(np.repeat(rgb, 5, 0), 5, 1).astype(np.float64) / 255
+    again = models[row].project(large, np.repeat(np.repeat(masks, 5, 1), 5, 2))
+    np.testing.assert_allclose(again.values, bev.values, atol=1e-3)
+
+
+def test_a_label_map_is_a_stack_of_masks(models, rgb, masks):
+    labels = np.where(masks[1], 4, np.where(masks[0], 1, -1)).astype(np.int16)
+    bev = models[ROWS[0]].project(rgb, labels, names={1: "floor", 4: "thing"})
+    stack = models[ROWS[0]].project(rgb, np.stack([labels == 1, labels == 4]))
+    assert bev.labels == ("floor", "thing")
+    np.testing.assert_allclose(bev.values, stack.values, atol=1e-5)
+
+
+def test_values_are_projected_level_by_level(rgb):
+    values = np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
+    bev = flat(2.0).project(rgb, values)
+    rounded = torch.from_numpy(np.floor(values * LEVELS + 0.5) / LEVELS)[None, None]
+    expected = project(rounded.float(), torch.full((1, 1, SIDE, SIDE), 2.0), CAMERA)[0]
+    np.testing.assert_allclose(bev.values, expected, atol=1e-6)
+
+
+def test_what_a_narrow_photograph_does_not_cover_is_outside_the_field_of_view(rgb):
+    full, narrow = (flat(2.0).project(rgb, np.ones((SIDE, SIDE), bool), hfov_deg=hfov) for hfov in (79, 40))
+    for bev, hfov in ((full, 79), (narrow, 40)):
+        half_m = 2 * np.tan(np.radians(hfov / 2))
+        assert bev.maps.any() and bev.maps.sum() == pytest.approx(2 * half_m / 0.125, abs=2)
+        assert (bev.fov.any(axis=0) == bev.maps[0].any(axis=0)).all()
+
+
+def test_boxes_come_back_with_label_and_score_where_they_are(rgb):
+    boxes = zerobev.Boxes(np.array([[30.0, 28, 34, 36], [44, 28, 48, 36]]), ("a", "b"), np.array([0.9, 0.4]))
+    table = flat(3.0).project(rgb, boxes).footprints()
+    assert table["label"].tolist() == ["a", "b"] and table["score"].tolist() == [0.9, 0.4]
+    np.testing.assert_allclose(table["right_m"], [0, 14 / CAMERA.focal_px * 3], atol=0.07)
+    np.testing.assert_allclose(table["forward_m"], 3.0625)
+
+
+def test_an_arrow_leads_from_the_disc_at_its_start_to_that_at_its_end(rgb):
+    field = np.zeros((SIDE, SIDE, 2), np.float32)
+    field[30:34, 10:13] = (30, 0)
+    arrows = flat(2.0).project(rgb, field)
+    moved_m = 30 / CAMERA.focal_px * 2
+    vector = arrows.end_m - arrows.start_m
+    assert len(vector) == 1 and vector[0] == pytest.approx([moved_m, 0], abs=0.13)
+    assert arrows.show().get_title() == ""
+    nearer = zerobev.Projector("a.2", CAMERA, None, lambda rgb: torch.full((1, 1, SIDE, SIDE), 1 + float(rgb.max())))
+    flow = zerobev.Flow.of(field, after=np.zeros_like(rgb))  # the second frame is dark: its depth is 1 m
+    assert nearer.project(rgb / 255 / (200 / 255), flow).end_m[0, 1] == pytest.approx(1.0625)
+
+
+def test_depth_is_zero_where_the_photograph_covers_nothing(models, rgb):
+    depth = models["a.2"].depth(rgb, hfov_deg=40)
+    assert depth.shape == (SIDE, SIDE) and depth[SIDE // 2, SIDE // 2] > 0 and not depth[0].any()
+
+
+@pytest.mark.parametrize(
+    ("photograph", "message"),
+    [
+        (np.zeros((4, 4)), r"rgb: expected \(H, W, 3\), found \(4, 4\)"),
+        (np.zeros((4, 4, 4), np.uint8), r"found \(4, 4, 4\)"),
+        (np.zeros((0, 4, 3), np.uint8), r"found \(0, 4, 3\)"),
+        (np.zeros((4, 4, 3), np.int32), r"rgb: expected uint8 or floating point, found int32"),
+        (np.full((4, 4, 3), 255.0), r"rgb: expected values in \[0, 1\], found 255 to 255"),
+        (np.full((4, 4, 3), np.nan), r"rgb: expected values in \[0, 1\], found NaN"),
+    ],
+)
+def test_what_is_no_photograph_is_refused(photograph, message):
+    with pytest.raises(InputError, match=message):
+        flat(1.0).project(photograph, np.ones((4, 4), bool))
+
+
+def test_masks_of_another_size_and_no_boxes_are_refused(rgb):
+    with pytest.raises(InputError, match=r"modality: expected \(64, 64\) or \(K, 64, 64\) of bool, found \(32, 32\)"):
+        flat(1.0).project(rgb, np.ones((32, 32), bool))
+    with pytest.raises(InputError, match="modality: expected an array, found list"):
+        flat(1.0).project(rgb, [[True], [True, False]])
+    with pytest.raises(InputError, match="at least one box"):
+        flat(1.0).project(rgb, zerobev.Boxes(np.zeros((0, 4)), (), np.zeros(0)))
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["project", *map(str, arguments)])
+    run_command(main)
+
+
+def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, monkeypatch, capsys):
+    photo, floor, thing, out = (tmp_path / name for name in ("photo.png", "floor.png", "thing.png", "map.png"))
+    Image.fromarray(rgb).save(photo)
+    for path, mask in ((floor, masks[0]), (thing, masks[1])):
+        Image.fromarray(mask.astype(np.uint8)).save(path)
+    command(monkeypatch, photo, "--masks", floor, thing, "--hfov", 85, "--out", out, "--row", ROWS[0])
+    expected = models[ROWS[0]].project(rgb, masks[:2], hfov_deg=85)
+    with np.load(out.with_suffix(".npz")) as file:
+        np.testing.assert_allclose(file["values"], expected.values, atol=1e-4)
+        assert file["labels"].tolist() == ["floor", "thing"]
+    picture = np.asarray(Image.open(out))
+    assert picture.shape[1] > 1.5 * picture.shape[0] and picture.std() > 5
+    assert "floor" in capsys.readouterr().out
+
+    (tmp_path / "boxes.csv").write_text("xmin,ymin,xmax,ymax,label,score\n20,28,40,46,thing,0.8\n")
+    command(monkeypatch, photo, "--boxes", tmp_path / "boxes.csv", "--out", out, "--row", "a.2")
+    assert "0.8" in capsys.readouterr().out
+
+
+def test_the_command_says_what_is_wrong(rgb, tmp_path, monkeypatch):
+    photo, text = tmp_path / "photo.png", tmp_path / "text.png"
+    Image.fromarray(rgb).save(photo)
+    text.write_text("no image")
+    for arguments, message in (
+        ((text, "--masks", photo, "--out", tmp_path / "a.png"), "text.png: expected an image"),
+        ((photo, "--labels", photo, "--out", tmp_path / "a.png"), "expected a label map of one channel"),
+        ((photo, "--masks", photo, "--out", tmp_path / "a.jpg"), "ends in .png"),
+        ((tmp_path / "none.png", "--masks", photo, "--out", tmp_path / "a.png"), "none.png: expected an image"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            command(monkeypatch, *arguments)
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_images_are_read_as_they_are_meant(tmp_path: Path):
+    upright = np.zeros((6, 8, 3), np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was turned by 90 degrees
+    Image.fromarray(upright).save(tmp_path / "turned.jpg", exif=exif)
+    assert read_photograph(tmp_path / "turned.jpg").shape == (8, 6, 3)
+    palette = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(6, 8) % 3, "P")
+    palette.putpalette([0, 0, 0, 255, 0, 0, 0, 255, 0])
+    palette.save(tmp_path / "labels.png")
+    assert np.unique(read_labels(tmp_path / "labels.png")).tolist() == [0, 1, 2]
+    assert read_mask(tmp_path / "labels.png").sum() == 32
