@@ -60,22 +60,22 @@ class AgentConfig:
     climb_m: float = 0.2  #: geometry up to this height above the floor does not block
     grid_m: float = 0.05  #: cell of the navigability grid
     island_m2: float = 0.5  #: smaller patches of free floor (inside furniture, say) are not navigable
-    least_view: float = 0.10  #: share of the map that a view must see; poses that face a wall see less
+    min_view: float = 0.10  #: share of the map that a view must see; poses that face a wall see less
 
 
 @dataclass(frozen=True)
 class TextureConfig:
     """The *Synth* textures (paper, supplement, "Synth."); one texel is 1 cm in generated homes."""
 
-    share: float = 0.20  #: of white texels in the finished texture
-    opened_share: float = 0.05  #: of white texels before dilation starts
+    white_fraction: float = 0.20  #: of white texels in the finished texture
+    opened_fraction: float = 0.05  #: of white texels before dilation starts
     kernel_px: tuple[int, int] = (10, 30)  #: smallest and largest kernel of opening and dilation
     tile_px: int = 1024  #: side of a tile of the texture bank
     tiles: int = 32  #: number of tiles in the bank
     #: structures are this many times smaller (below 1: larger), drawn log-uniformly for each sample; equal ends are a
     #: fixed scale, and 1 is the paper's
     scales: tuple[float, float] = (1.0, 1.0)
-    modsem_share: float = 0.30  #: of white texels in *Mod. Sem.* textures
+    modsem_fraction: float = 0.30  #: of white texels in *Mod. Sem.* textures
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,9 @@ class ModelConfig:
     layers: int = 2  #: of the column encoder, and of the ray decoder
     dropout: float = 0.1
     ground_start: bool = False  #: rays begin by looking at the image row where the floor is seen (not in the paper)
-    zero_gain: float = 1.0  #: factor on the first weights of the zero-shot stream's CNN
-    residual_gain: float = 1.0  #: factor on the first weights of the residual's embedding
-    prior: float = 0.5  #: probability of white that maps start from
+    zero_init_gain: float = 1.0  #: factor on the first weights of the zero-shot stream's CNN
+    residual_init_gain: float = 1.0  #: factor on the first weights of the residual's embedding
+    foreground_prior: float = 0.5  #: probability of white that maps start from
     band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
@@ -144,9 +144,10 @@ class Scale:
     train: TrainConfig
     depth: TrainConfig  #: of the depth estimator
     texture: TextureConfig = field(default_factory=TextureConfig)
-    blank: float = 0.0  #: share of the samples whose zero-shot image, and its map, are made empty (not in the paper)
-    #: share of the *Synth* samples in which all that is raised is painted from above (not in the paper)
-    upright: float = 0.0
+    #: fraction of the samples whose zero-shot image and map are made empty (not in the paper)
+    empty_fraction: float = 0.0
+    #: fraction of the *Synth* samples whose texture is extruded along the vertical (not in the paper)
+    extruded_fraction: float = 0.0
     test_views: int | None = None  #: of each test scene, the first ones, that networks are evaluated on; None: all
     #: first weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
     backbone: str = ""
@@ -198,9 +199,9 @@ SCALES = {
                 layers=1,
                 dropout=0.0,
                 ground_start=True,
-                zero_gain=4.0,
-                residual_gain=6.0,
-                prior=0.1,
+                zero_init_gain=4.0,
+                residual_init_gain=6.0,
+                foreground_prior=0.1,
             ),
             train=TrainConfig(
                 steps=600,
@@ -212,8 +213,8 @@ SCALES = {
             ),
             depth=TrainConfig(steps=8000, learning_rate=4e-3, decay_every=220, validate_every=1000, warmup=50),
             texture=TextureConfig(scales=(0.5, 1.0)),
-            blank=0.2,
-            upright=0.75,
+            empty_fraction=0.2,
+            extruded_fraction=0.75,
             test_views=24,
         ),
         Scale(

@@ -28,7 +28,7 @@ import zerobev
 from zerobev.common.errors import InputError
 from zerobev.evaluation.metrics import Counts
 from zerobev.experiments.records import Record, RecordStore
-from zerobev.inference.projector import MOST_IMAGES
+from zerobev.inference.projector import MAX_IMAGES
 from zerobev.scenes.hm3dsem import FIRST_LINE, read_instances, read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 
@@ -456,8 +456,8 @@ def test_valid_arguments_of_project_are_taken(projector: zerobev.Projector) -> N
 
 def test_more_images_than_fit_are_refused(projector: zerobev.Projector) -> None:
     dot = np.ones((1, 1, 3), np.uint8)
-    with pytest.raises(InputError, match=f"expected {MOST_IMAGES} binary images at most, found {MOST_IMAGES + 1}"):
-        projector.project(dot, np.ones((MOST_IMAGES + 1, 1, 1), bool))
+    with pytest.raises(InputError, match=f"expected {MAX_IMAGES} binary images at most, found {MAX_IMAGES + 1}"):
+        projector.project(dot, np.ones((MAX_IMAGES + 1, 1, 1), bool))
     with pytest.raises(InputError, match="binary images at most"):
         projector.project(dot, np.ones((10**6, 1, 1), np.float32))
     with pytest.raises(InputError, match=r"after: expected the first frame's shape \(8, 8, 3\), found \(9, 8, 3\)"):

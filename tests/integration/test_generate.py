@@ -117,7 +117,7 @@ def test_resumed_run_redoes_nothing_and_equals_an_unbroken_one(folders, recorded
 OTHER_RUNS = [
     (VIEWS + 1, CAMERA, TEXTURE, SEED),
     (VIEWS, replace(CAMERA, bev_px=11), TEXTURE, SEED),
-    (VIEWS, CAMERA, replace(TEXTURE, modsem_share=0.2), SEED),
+    (VIEWS, CAMERA, replace(TEXTURE, modsem_fraction=0.2), SEED),
     (VIEWS, CAMERA, TEXTURE, 6),
 ]
 

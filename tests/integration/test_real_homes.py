@@ -16,7 +16,7 @@ from zerobev.data.shards import Shard
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.evaluation.metrics import Counts
 from zerobev.evaluation.real_homes import METHODS, evaluate_homes, main
-from zerobev.geometry.projection import project
+from zerobev.geometry.projection import inverse_project
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 from zerobev.models import load_model
 from zerobev.scenes.hm3dsem_writer import write_scene
@@ -48,7 +48,7 @@ def test_counts_are_those_of_recorded_shards(homes, counts, tmp_path):
     paths = [generate_shard(folder, tmp_path, 3, model.camera, TextureConfig(), 5) for folder in folders]
     views = ViewSet([Shard(path, model.camera, TextureConfig()) for path in paths])
     recorded = {
-        "a.1": lambda batch: project(batch["zero"], batch["depth"], model.camera) > 0,
+        "a.1": lambda batch: inverse_project(batch["zero"], batch["depth"], model.camera) > 0,
         ROWS[0]: model_predictor(model, "cpu"),
     }
     for row, projector in recorded.items():

@@ -22,12 +22,12 @@ import torch
 from zerobev.common.errors import run_command
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, CameraConfig, Scale, scale
-from zerobev.data.samples import DepthProjTuples, ModSemTuples, SynthTuples, TupleStream, ViewSet
+from zerobev.data.samples import DepthProjSamples, ModSemSamples, SampleStream, SynthSamples, ViewSet
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank, modsem_textures, random_rectangles
 from zerobev.data.views import View, ViewSource
 from zerobev.geometry.cameras import Pose
-from zerobev.geometry.projection import project_mask
+from zerobev.geometry.projection import inverse_project_mask
 from zerobev.rendering.rerender import Rerenderer
 from zerobev.scenes.hm3dsem import read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
@@ -96,11 +96,11 @@ def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> di
     views = ViewSet([Shard(shard, setting.camera, setting.texture)])
     stored = [views.locate(index)[1] for index in range(len(views))]
     banks = {f"synth {share:g}": noise_bank(setting, share) for share in DENSITIES}
-    streams: dict[str, TupleStream] = {
-        name: SynthTuples(views, bank, setting.camera, seed=0, batch=1) for name, bank in banks.items()
+    streams: dict[str, SampleStream] = {
+        name: SynthSamples(views, bank, setting.camera, seed=0, batch=1) for name, bank in banks.items()
     }
-    streams["mod sem"] = ModSemTuples(views, setting.camera, seed=0, batch=1)
-    streams["depth proj"] = DepthProjTuples(views, setting.camera, seed=0, batch=1)
+    streams["mod sem"] = ModSemSamples(views, setting.camera, seed=0, batch=1)
+    streams["depth proj"] = DepthProjSamples(views, setting.camera, seed=0, batch=1)
     rng = np.random.default_rng(0)
     textures = {name: texture_images(scene, bank, rng) for name, bank in banks.items()}
     textures["mod sem"] = [modsem_textures(chart, setting.texture, rng, 1)[0] for chart in scene.chart_instance]
@@ -129,7 +129,7 @@ def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> di
 
 def noise_bank(setting: Scale, share: float) -> TextureBank:
     """A bank of the scale's size (32 tiles at most), its structures squares: a look-up takes no notice."""
-    texture = replace(setting.texture, share=share, tiles=min(setting.texture.tiles, 32))
+    texture = replace(setting.texture, white_fraction=share, tiles=min(setting.texture.tiles, 32))
     side = texture.tile_px // 16
     squares = np.random.default_rng(0).random((texture.tiles, side, side)) < share
     return TextureBank(squares.repeat(16, axis=1).repeat(16, axis=2), texture)
@@ -153,7 +153,7 @@ def rerender(
     if textured:
         return zero, rerenderer.bev(pose)
     zero = random_rectangles(depth.shape, rng)
-    return zero, project_mask(zero, np.ascontiguousarray(depth, np.float32), camera)
+    return zero, inverse_project_mask(zero, np.ascontiguousarray(depth, np.float32), camera)
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:

@@ -22,7 +22,7 @@ from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
 from zerobev.common.errors import InputError, run_command
 from zerobev.config import SCALES, Scale
 from zerobev.data.generate import shard_path
-from zerobev.data.samples import SynthTuples, ViewSet, collate, semantic_sample
+from zerobev.data.samples import SynthSamples, ViewSet, collate, semantic_sample
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import model_inputs
@@ -34,7 +34,7 @@ from zerobev.experiments.workspace import Workspace, fingerprint
 from zerobev.models import build
 from zerobev.models.depth import DepthNet
 from zerobev.scenes.hm3dsem import read_scene
-from zerobev.training.depth import DepthTuples, depth_objective
+from zerobev.training.depth import DepthSamples, depth_objective
 from zerobev.training.loader import Source, gpu_workers
 from zerobev.training.train import Objective, dice_objective, training_accelerator
 
@@ -161,9 +161,14 @@ def measure(scale: Scale, home: Path | None) -> dict[str, Any]:
         source = ViewSource(scene, scale.camera, scale.texture, np.random.default_rng(0))
         drawn = [source.draw() for _ in range(_VIEWS)]
         stored_s = _seconds(lambda: write_shard(path, scene, drawn, scale.camera, scale.texture, 0)) / _VIEWS
-        views, bank = ViewSet([Shard(path, scale.camera, scale.texture)]), noise_bank(scale, scale.texture.share)
-        synth = SynthTuples(views, bank, scale.camera, 0, samples, scale.blank, upright=scale.upright)
-        depth, test = DepthTuples(views, 0, samples), collate([semantic_sample(views, 0, scale.camera)])
+        views, bank = (
+            ViewSet([Shard(path, scale.camera, scale.texture)]),
+            noise_bank(scale, scale.texture.white_fraction),
+        )
+        synth = SynthSamples(
+            views, bank, scale.camera, 0, samples, scale.empty_fraction, extruded_fraction=scale.extruded_fraction
+        )
+        depth, test = DepthSamples(views, 0, samples), collate([semantic_sample(views, 0, scale.camera)])
         network, estimator = build("c", scale.camera, scale.model), DepthNet(scale.camera, scale.model)
         return {
             "view_bytes": path.stat().st_size / _VIEWS,
@@ -179,7 +184,7 @@ def _network(net: nn.Module, objective: Objective, data: Source, samples: int, t
     batch = {name: value.to(device) for name, value in data.batch(0, 0, 1).items()}
     drawn_s = _seconds(lambda: data.batch(1, 0, 1)) / samples
     process = 2**20 * peak_memory_mb() if device.type == "cpu" else 0
-    kept = kept_bytes(lambda: objective(net, batch).total, net)
+    kept = saved_bytes(lambda: objective(net, batch).total, net)
     _, passed_s = (_seconds(lambda: objective(net, batch).total.backward()) / samples for _ in range(2))
     # beside a GPU, workers draw the batches to come
     train_s = max(drawn_s / gpu_workers(), passed_s) if device.type == "cuda" else drawn_s + passed_s
@@ -189,7 +194,7 @@ def _network(net: nn.Module, objective: Objective, data: Source, samples: int, t
     return Network(weights, process, kept / samples, train_s, test_s)
 
 
-def kept_bytes(forward: Callable[[], Tensor], net: nn.Module) -> int:
+def saved_bytes(forward: Callable[[], Tensor], net: nn.Module) -> int:
     """What autograd keeps of a forward pass for the backward one, beside the weights; storage that is shared once."""
     kept: dict[int, int] = {}
 

@@ -22,8 +22,8 @@ from zerobev.benchmarks.training import Machine, Run, measure_paper_step, measur
 from zerobev.common.errors import run_command
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, Scale, scale
-from zerobev.data.samples import SynthTuples
-from zerobev.experiments.records import kept, peak_memory_mb
+from zerobev.data.samples import SynthSamples
+from zerobev.experiments.records import cached, peak_memory_mb
 from zerobev.experiments.workspace import Workspace
 from zerobev.models import BevModel, build
 
@@ -73,7 +73,7 @@ def measure_sizes(setting: Scale, machine: Machine, repeats: int) -> dict[str, d
     workspace = Workspace(setting.name)
     for scenes in _SCENES:
         views = workspace.views("train", scenes)
-        stream = SynthTuples(views, workspace.bank(), camera, 0, setting.train.batch)
+        stream = SynthSamples(views, workspace.bank(), camera, 0, setting.train.batch)
         runs[f"scenes {scenes}"] = partial(_next_batch, stream, itertools.count())
     found = machine.milliseconds(runs, repeats)
     base = {"image": "image 1x", "map": "map 1x", "scenes": f"scenes {_SCENES[0]}"}
@@ -103,7 +103,7 @@ def _peak_of(part: str, name: str) -> float:
             net(batch["rgb"], batch["zero"])
     elif part == "data":
         workspace = Workspace(name)
-        stream = SynthTuples(workspace.views("train", _SCENES[-1]), workspace.bank(), setting.camera, 0, 16)
+        stream = SynthSamples(workspace.views("train", _SCENES[-1]), workspace.bank(), setting.camera, 0, 16)
         for number in range(20):
             stream.batch(number)
     return peak_memory_mb()
@@ -114,7 +114,7 @@ def _one_by_one(net: BevModel, rgb: Tensor, images: Tensor) -> None:
         net(rgb, image)
 
 
-def _next_batch(stream: SynthTuples, steps: Iterator[int]) -> None:
+def _next_batch(stream: SynthSamples, steps: Iterator[int]) -> None:
     stream.batch(next(steps))
 
 
@@ -162,7 +162,7 @@ def table(measured: dict[str, Any]) -> list[str]:
 def recorded_benchmark(workspace: Workspace) -> dict[str, Any]:
     """The measurements of a report, `benchmark.json`: read where they are recorded, else taken now (some minutes)."""
     identity = {"version": _VERSION, "scale": workspace.scale.name}
-    return kept(workspace.reports / "benchmark.json", identity, lambda: measure(workspace.scale, repeats=9))
+    return cached(workspace.reports / "benchmark.json", identity, lambda: measure(workspace.scale, repeats=9))
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode, flop_registry
 
 from zerobev.benchmarks.data import spread
 from zerobev.config import CameraConfig, Scale, scale
-from zerobev.data.samples import SynthTuples
+from zerobev.data.samples import SynthSamples
 from zerobev.experiments.workspace import Workspace
 from zerobev.models import BevModel, ZeroBEV, build
 from zerobev.training.loader import Source, batches
@@ -152,7 +152,7 @@ def _storage(tensor: Tensor) -> int:
     return tensor.untyped_storage()._cdata
 
 
-def least_milliseconds(run: Run, peak_tflops: float, bandwidth_gbs: float) -> float:
+def min_milliseconds(run: Run, peak_tflops: float, bandwidth_gbs: float) -> float:
     """The roofline of `run`: what its operations take if each is held up by products or by memory alone.
 
     Bytes that an operation finds in a cache are counted as if it did not: small operations can be faster.
@@ -213,7 +213,7 @@ def _against_the_machine(
     peak, best = (2 * _MATMUL**3 / milliseconds["matrix product"][of] / 1e9 for of in ("median", "low"))
     bandwidth = 2 * 4 * _COPIED / milliseconds["copy"]["median"] / 1e6
     operations = {name: flops(run) for name, run in runs.items()}
-    least = {name: least_milliseconds(run, peak, bandwidth) for name, run in runs.items()}
+    least = {name: min_milliseconds(run, peak, bandwidth) for name, run in runs.items()}
     return {
         "milliseconds": milliseconds,
         "gigaflops": {name: count / 1e9 for name, count in operations.items()},
@@ -243,10 +243,12 @@ def waiting_share(net: BevModel, stream: Source, machine: Machine, workers: int)
     return {"share": waited / (ended - started), "milliseconds": 1e3 * (ended - started) / _WAITED}
 
 
-def _stream(setting: Scale) -> SynthTuples:
+def _stream(setting: Scale) -> SynthSamples:
     workspace = Workspace(setting.name)
-    samples = (setting.camera, 0, setting.train.batch, setting.blank)
-    return SynthTuples(workspace.views("train", 1), workspace.bank(), *samples, upright=setting.upright)
+    samples = (setting.camera, 0, setting.train.batch, setting.empty_fraction)
+    return SynthSamples(
+        workspace.views("train", 1), workspace.bank(), *samples, extruded_fraction=setting.extruded_fraction
+    )
 
 
 def _leaves(maps: Iterable[Tensor]) -> list[Tensor]:

@@ -142,7 +142,7 @@ def verify(out: Path) -> list[str]:
     """
     manifest = _read_manifest(out)
     camera = CameraConfig(**manifest["camera"])
-    texture = TextureConfig(modsem_share=manifest["modsem_share"])
+    texture = TextureConfig(modsem_fraction=manifest["modsem_share"])
     listed = manifest["shards"]
     names = sorted({path.name for path in out.glob("[!.]*.h5")} | set(listed))
     problems = []

@@ -19,7 +19,7 @@ from zerobev.data.shards import Shard
 from zerobev.data.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.data.views import View
 from zerobev.geometry.cameras import Pose, bev_cell_centres
-from zerobev.geometry.projection import map_coordinates, project_mask
+from zerobev.geometry.projection import inverse_project_mask, map_coordinates
 
 Sample = dict[str, np.ndarray | np.int64]
 #: The images of K modalities in FPV (K, H, H) and the same on the map (K, M, M), bool or float.
@@ -31,20 +31,22 @@ _cell_centres = cache(bev_cell_centres)
 
 
 class ViewSet:
-    """The views of several shards under one index; of each shard the first `most`, or all."""
+    """The views of several shards under one index; of each shard the first `max_views`, or all."""
 
-    def __init__(self, shards: list[Shard], most: int | None = None) -> None:
+    def __init__(self, shards: list[Shard], max_views: int | None = None) -> None:
         self.shards = shards
-        self._most = most
-        self._start = np.cumsum([0, *(len(shard) if most is None else min(len(shard), most) for shard in shards)])
+        self._max_views = max_views
+        self._start = np.cumsum(
+            [0, *(len(shard) if max_views is None else min(len(shard), max_views) for shard in shards)]
+        )
         self._depth: Sequence[np.ndarray] | None = None
 
     def __len__(self) -> int:
         return int(self._start[-1])
 
-    def first(self, most: int | None) -> "ViewSet":
-        """Of each shard the first `most` of these views, or all."""
-        some = ViewSet(self.shards, self._most if most is None else most)
+    def first(self, max_views: int | None) -> "ViewSet":
+        """Of each shard the first `max_views` of these views, or all."""
+        some = ViewSet(self.shards, self._max_views if max_views is None else max_views)
         some._depth = self._depth
         return some
 
@@ -58,7 +60,7 @@ class ViewSet:
         found = [len(shard_maps) for shard_maps in maps]
         if found != expected:
             raise InputError(f"depth maps: expected {expected} views a shard, found {found}")
-        changed = ViewSet(self.shards, self._most)
+        changed = ViewSet(self.shards, self._max_views)
         changed._depth = maps
         return changed
 
@@ -75,7 +77,7 @@ class ViewSet:
         return shard, replace(view, depth=depth)
 
 
-class ViewOrder:
+class ViewSampler:
     """Which view the samples of a training take: each pass over them is in a new order, drawn from the seed."""
 
     def __init__(self, views: int, seed: int) -> None:
@@ -91,23 +93,25 @@ class ViewOrder:
         return int(self._permutation[position])
 
 
-class TupleStream(ABC):
+class SampleStream(ABC):
     """Endless training tuples, whatever their modality.
 
     Sample i is a function of (seed, i) alone: training may stop at any step and go on, or be spread over
     processes, and sees the same data. Each pass over the views is in a new random order.
 
-    blank: share of the samples whose modality is made empty, in the image and on the map. Textures fill every view; the
-    mask of a class is empty in most, and what a network paints on the map of an empty image is all error.
+    empty_fraction: fraction of the samples whose modality is made empty, in the image and on the map. Textures fill
+        every view; the mask of a class is empty in most views, and all that is predicted for an empty image is error.
     """
 
-    def __init__(self, views: ViewSet, camera: CameraConfig, seed: int, batch: int, blank: float = 0.0) -> None:
+    def __init__(
+        self, views: ViewSet, camera: CameraConfig, seed: int, batch: int, empty_fraction: float = 0.0
+    ) -> None:
         self._views = views
         self._camera = camera
         self._seed = seed
         self._batch = batch
-        self._blank = blank
-        self._order = ViewOrder(len(views), seed)
+        self._empty_fraction = empty_fraction
+        self._order = ViewSampler(len(views), seed)
 
     @abstractmethod
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
@@ -123,21 +127,22 @@ class TupleStream(ABC):
         scene, view = self._views.locate(self._order[index])
         rng = np.random.default_rng([self._seed, 1, index])
         zero, target = self.pair(view, scene, rng)
-        if rng.random() < self._blank:
+        if rng.random() < self._empty_fraction:
             zero, target = np.zeros_like(zero), np.zeros_like(target)
         return view_sample(view, self._camera, scene, zero, target)
 
 
-class SynthTuples(TupleStream):
+class SynthSamples(SampleStream):
     """*Synth* textures (paper, Section 3.2): a fresh one for every sample, or one a scene as in the paper.
 
     With `fresh=False` the texture of a scene, its scale included, is a function of (seed, scene), the same in all
     epochs. Scales are drawn between `bank.config.scales`.
 
-    upright: share of the samples, or of the scenes, in which all that is raised is painted from above. On a mesh that
-        is painted all around, what the map shows of a wall or a shelf is its upper side, which the camera does not see:
-        the texture of its front says nothing of it. Classes and most other modalities do not change along the
-        vertical; a training of a few hundred steps learns from such samples where upright surfaces are.
+    extruded_fraction: fraction of the samples (with `fresh=False`, of the scenes) whose texture is extruded: constant
+        along the vertical on everything raised. If the mesh is painted all around, the map shows the upper side of a
+        wall or a shelf, and the camera its front, whose texture is independent of it. Classes and most other
+        modalities are constant along the vertical; from extruded samples the network learns the positions of raised
+        surfaces.
     """
 
     def __init__(
@@ -147,14 +152,14 @@ class SynthTuples(TupleStream):
         camera: CameraConfig,
         seed: int,
         batch: int,
-        blank: float = 0.0,
+        empty_fraction: float = 0.0,
         fresh: bool = True,
-        upright: float = 0.0,
+        extruded_fraction: float = 0.0,
     ) -> None:
-        super().__init__(views, camera, seed, batch, blank)
+        super().__init__(views, camera, seed, batch, empty_fraction)
         self._bank = bank
         self._fresh = fresh
-        self._upright = upright
+        self._extruded_fraction = extruded_fraction
 
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
         """The texture on the surfaces as both sensors see it."""
@@ -163,14 +168,14 @@ class SynthTuples(TupleStream):
             rng = np.random.default_rng([self._seed, 2, scene])
         draw = self._bank.draw(rng, shard.charts + 1)  # the last one is worn by what is painted from above
         texels = view.fpv_texel, view.bev_texel
-        if rng.random() < self._upright:
-            texels = painted_from_above(view, self._camera, shard.charts)
+        if rng.random() < self._extruded_fraction:
+            texels = extruded_texels(view, self._camera, shard.charts)
         white = self._bank.look_up(np.concatenate([image.reshape(-1, 3) for image in texels]), draw)
         zero, target = np.split(white, [view.depth.size])
         return zero.reshape(1, *view.depth.shape), target.reshape(1, *view.fov.shape)
 
 
-def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np.ndarray, np.ndarray]:
+def extruded_texels(view: View, camera: CameraConfig, chart: int) -> tuple[np.ndarray, np.ndarray]:
     """The texels of a view, (H, H, 3) and (M, M, 3) int16, with one chart more: the plan, in centimetres of the world.
 
     It takes the place of all that is raised, so that a texture of it is the same all along the vertical. The image's
@@ -191,7 +196,7 @@ def painted_from_above(view: View, camera: CameraConfig, chart: int) -> tuple[np
     return fpv.reshape(view.fpv_texel.shape), bev.reshape(view.bev_texel.shape)
 
 
-class ModSemTuples(TupleStream):
+class ModSemSamples(SampleStream):
     """*Mod. Sem.* textures (paper, Table 5 and supplement): eroded objects; a sample shows one of a scene's draws."""
 
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
@@ -200,16 +205,16 @@ class ModSemTuples(TupleStream):
         return view.fpv_modsem[None] & bit > 0, view.bev_modsem[None] & bit > 0
 
 
-class DepthProjTuples(TupleStream):
+class DepthProjSamples(SampleStream):
     """*Depth proj.* (paper, Table 5 and supplement): random rectangles, projected with the depth of the view."""
 
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
         """Rectangles in the image, and the cells that a white pixel falls into."""
         zero = random_rectangles(view.depth.shape, rng)
-        return zero[None], project_mask(zero, view.depth, self._camera)[None]
+        return zero[None], inverse_project_mask(zero, view.depth, self._camera)[None]
 
 
-class SemanticTuples(TupleStream):
+class SemanticSamples(SampleStream):
     """The eight classes as modalities (K = 8, in the order of `LABELS`): what TIM and VPN are trained on."""
 
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:

@@ -24,7 +24,7 @@ _FIELDS = tuple(field.name for field in fields(View))
 
 def recorded_with(camera: CameraConfig, texture: TextureConfig) -> dict[str, Any]:
     """What views depend on beside their scene, as plain data: the camera, and the share of *Mod. Sem.* textures."""
-    return {"camera": asdict(camera), "modsem_share": texture.modsem_share}
+    return {"camera": asdict(camera), "modsem_share": texture.modsem_fraction}
 
 
 def write_shard(

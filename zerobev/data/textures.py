@@ -85,30 +85,31 @@ def opening(mask: np.ndarray, runs: np.ndarray) -> np.ndarray:
 def synth_texture(
     shape: tuple[int, int], config: TextureConfig, sources: SourceImages, rng: np.random.Generator
 ) -> np.ndarray:
-    """One seamless *Synth* texture: (rows, cols) bool with `config.share` white (paper, supplement, "Synth.").
+    """One seamless *Synth* texture: (rows, cols) bool with `config.white_fraction` white (paper, supplement, "Synth.").
 
-    Opened structures of random sources are added until `config.opened_share` is white, then everything is
-    dilated, again and again, until `config.share` is; the last dilation is limited, so the share is exact.
+    Opened structures of random sources are added until `config.opened_fraction` is white, then everything is
+    dilated, again and again, until `config.white_fraction` is; the last dilation is limited, so the share is exact.
     """
-    if not 0 < config.opened_share <= config.share < 1:
+    if not 0 < config.opened_fraction <= config.white_fraction < 1:
         raise InputError(
-            f"texture shares: expected 0 < opened <= final < 1, found {config.opened_share} and {config.share}"
+            "texture fractions: expected 0 < opened <= white < 1, "
+            f"found {config.opened_fraction} and {config.white_fraction}"
         )
     texels = shape[0] * shape[1]
     texture = opened_structures(shape, config, sources, rng)
-    return _dilated_until(texture, round(config.share * texels), config.kernel_px, rng, wrap=True)
+    return _dilated_until(texture, round(config.white_fraction * texels), config.kernel_px, rng, wrap=True)
 
 
 def opened_structures(
     shape: tuple[int, int], config: TextureConfig, sources: SourceImages, rng: np.random.Generator
 ) -> np.ndarray:
-    """The first half of `synth_texture`: (rows, cols) bool, white from `opened_share` to 10 % (relative) above.
+    """The first half of `synth_texture`: (rows, cols) bool, white from `opened_fraction` to 10 % (relative) above.
 
     Each source adds no more than four of the largest kernels, so that structures of many sources are spread
     over the texture; connected structures that are too large, of an almost white mask above all, are left out.
     """
     texture = np.zeros(shape, bool)
-    wanted = config.opened_share * texture.size
+    wanted = config.opened_fraction * texture.size
     for _ in range(MAX_SOURCES):
         missing = wanted - np.count_nonzero(texture)
         if missing <= 0:
@@ -186,7 +187,7 @@ def modsem_textures(
     """Independent *Mod. Sem.* textures of a chart: (draws, rows, cols) bool (paper, supplement, "Mod. Sem.").
 
     `instance_image` (rows, cols) uint16 holds instance ids, 0 for none. All texels of instances are white, then
-    eroded by random kernels until `config.modsem_share` of them is left. Two readings of the paper are taken:
+    eroded by random kernels until `config.modsem_fraction` of them is left. Two readings of the paper are taken:
     - The share is of the texels that an instance covers, not of the chart: as much of the surfaces is white as
       with a *Synth* texture of this share, however much of the atlas is unused.
     - Instances erode one by one: a line one texel wide is black where two of them touch, and so is all beyond the
@@ -199,7 +200,7 @@ def modsem_textures(
     for here, there in (np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:]):
         white[here] &= (instance_image[here] == instance_image[there]) | ~covered[there]
     ground = ~np.pad(white, 1)
-    black = ground.size - round(config.modsem_share * np.count_nonzero(covered))
+    black = ground.size - round(config.modsem_fraction * np.count_nonzero(covered))
     eroded = [_dilated_until(ground, black, config.kernel_px, rng, wrap=False) for _ in range(draws)]
     return ~np.array(eroded)[:, 1:-1, 1:-1]
 

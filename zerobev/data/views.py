@@ -70,7 +70,7 @@ class ViewSource:
             if view is not None:
                 return view
         raise InputError(
-            f"scene {self.scene.name}: expected a view of at least {self._agent.least_view:.0%} of the map, "
+            f"scene {self.scene.name}: expected a view of at least {self._agent.min_view:.0%} of the map, "
             f"found none in {_TRIES} poses"
         )
 
@@ -80,7 +80,7 @@ class ViewSource:
             return None
         fpv = self._caster.fpv(pose, self._camera)
         fov = fov_mask(fpv.distance, self._camera)
-        if fov.mean() < self._agent.least_view:
+        if fov.mean() < self._agent.min_view:
             return None
         bev = self._caster.bev(pose, self._camera)
         return View(
@@ -98,4 +98,4 @@ class ViewSource:
         )
 
     def _is_blocked(self, camera: CameraConfig, pose: Pose) -> bool:
-        return fov_mask(self._caster.fpv(pose, camera).distance, camera).mean() < self._agent.least_view
+        return fov_mask(self._caster.fpv(pose, camera).distance, camera).mean() < self._agent.min_view

@@ -23,7 +23,7 @@ from zerobev.data.samples import class_masks, collate, view_sample
 from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import Predictor, evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
-from zerobev.geometry.projection import project
+from zerobev.geometry.projection import inverse_project
 from zerobev.inference.projector import GEOMETRIC, load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 from zerobev.scenes.hm3dsem import find_scenes, read_scene
@@ -53,7 +53,7 @@ def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict
         raise InputError(f"views: expected 1 or more, found {views}")
     projectors = {row: load(row) for row in (GEOMETRIC, *ROWS)}
     camera = projectors[GEOMETRIC].camera
-    methods: dict[str, Predictor] = {ORACLE: lambda batch: project(batch["zero"], batch["depth"], camera) > 0}
+    methods: dict[str, Predictor] = {ORACLE: lambda batch: inverse_project(batch["zero"], batch["depth"], camera) > 0}
     methods |= {row: projector.predict for row, projector in projectors.items()}
     total = {row: Counts.empty(len(folders), len(LABELS)) for row in METHODS}
     broken: dict[str, str] = {}

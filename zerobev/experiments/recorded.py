@@ -8,7 +8,7 @@ import pandas as pd
 from zerobev.evaluation.metrics import Counts
 from zerobev.evaluation.motion import evaluate_motion, moving_pairs
 from zerobev.evaluation.unseen import VIEWS, evaluate_unseen
-from zerobev.experiments.records import kept
+from zerobev.experiments.records import cached
 from zerobev.experiments.workspace import Workspace
 from zerobev.inference.shipped_weights import shipped_runs
 from zerobev.scenes.homes import ensure_homes
@@ -26,7 +26,7 @@ def recorded_motion(workspace: Workspace, count: int = 32) -> pd.DataFrame:
         return evaluate_motion(moving_pairs(homes, count, seed=0)).to_dict(orient="list")
 
     identity = {"weights": shipped_runs(), "pairs": count, "scenes": asdict(workspace.scale.scenes)}
-    return pd.DataFrame(kept(workspace.reports / "motion.json", identity, compute))
+    return pd.DataFrame(cached(workspace.reports / "motion.json", identity, compute))
 
 
 def recorded_unseen(workspace: Workspace) -> dict[str, Counts]:
@@ -41,5 +41,5 @@ def recorded_unseen(workspace: Workspace) -> dict[str, Counts]:
         return {row: counts.to_json() for row, counts in evaluate_unseen(homes).items()}
 
     identity = {"weights": shipped_runs(), "views": VIEWS, "scenes": asdict(workspace.scale.scenes)}
-    found = kept(workspace.reports / "unseen.json", identity, compute)
+    found = cached(workspace.reports / "unseen.json", identity, compute)
     return {row: Counts.from_json(counts) for row, counts in found.items()}

@@ -141,7 +141,7 @@ def _arrays(path: Path, expected: str) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: expected {expected}, found {found}") from None
 
 
-def kept(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def cached(path: Path, identity: dict[str, Any], compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """What `compute` makes of `identity`: read from `path` where it is recorded there, else computed and recorded.
 
     The result is what JSON makes of it, keys in order, the first time, too: what is shown of it stays the same.

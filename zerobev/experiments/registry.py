@@ -14,11 +14,11 @@ class Experiment:
     row: str
     network: str | None = "c"  #: a row of `models.variants.VARIANTS`; None for P^-1
     stream: str = "synth"  #: zero-shot stream of training: "synth", "modsem", "depthproj", or "classes" (not zero-shot)
-    share: float = 0.20  #: of white texels (Synth)
+    white_fraction: float = 0.20  #: of white texels (Synth)
     scales: tuple[float, float] | None = None  #: see `TextureConfig.scales`; None: those of the scale
     fresh: bool = True  #: a new texture for every sample; else one a scene, as in the paper
-    upright: float | None = None  #: see `Scale.upright`; None: that of the scale
-    paper_start: bool = False  #: as in the paper: no blank samples, nothing painted from above, plain first weights
+    extruded: float | None = None  #: see `Scale.extruded_fraction`; None: that of the scale
+    paper_start: bool = False  #: as in the paper: no empty samples, no extruded textures, plain first weights
     train_depth: tuple[str, ...] = ("gt",)  #: "gt" or "predicted", one stage of training after the other
     test_depth: str = "predicted"  #: what P^-1 and the residual model get in the test
 
@@ -29,23 +29,25 @@ class Experiment:
 
     def texture(self, scale: Scale) -> TextureConfig:
         """The textures that it is trained on."""
-        return replace(scale.texture, share=self.share, scales=self.scales or scale.texture.scales)
+        return replace(scale.texture, white_fraction=self.white_fraction, scales=self.scales or scale.texture.scales)
 
     def model(self, scale: Scale) -> ModelConfig:
         """The network's configuration; its variant is not yet part of it."""
         if not self.paper_start:
             return scale.model
-        return replace(scale.model, ground_start=False, zero_gain=1.0, residual_gain=1.0, prior=0.5)
+        return replace(
+            scale.model, ground_start=False, zero_init_gain=1.0, residual_init_gain=1.0, foreground_prior=0.5
+        )
 
-    def upright_share(self, scale: Scale) -> float:
-        """The share of samples in which all that is raised is painted from above."""
-        if self.upright is not None:
-            return self.upright
-        return 0.0 if self.paper_start else scale.upright
+    def extruded_fraction(self, scale: Scale) -> float:
+        """The fraction of samples whose texture is extruded."""
+        if self.extruded is not None:
+            return self.extruded
+        return 0.0 if self.paper_start else scale.extruded_fraction
 
-    def blank(self, scale: Scale) -> float:
-        """The share of blank samples. The masks of the classes need none: many are empty."""
-        return 0.0 if self.paper_start or self.stream == "classes" else scale.blank
+    def empty_fraction(self, scale: Scale) -> float:
+        """The fraction of empty samples. The masks of the classes need none: many are empty."""
+        return 0.0 if self.paper_start or self.stream == "classes" else scale.empty_fraction
 
 
 def _experiments() -> dict[str, Experiment]:
@@ -71,17 +73,17 @@ def _experiments() -> dict[str, Experiment]:
         Experiment("d.gt", "d"),
         Experiment("d.predicted", "d", train_depth=("predicted",)),
         # Table 4
-        Experiment("c.10", share=0.10),
-        Experiment("c.15", share=0.15),
-        Experiment("c.25", share=0.25),
-        Experiment("c.30", share=0.30),
+        Experiment("c.10", white_fraction=0.10),
+        Experiment("c.15", white_fraction=0.15),
+        Experiment("c.25", white_fraction=0.25),
+        Experiment("c.30", white_fraction=0.30),
         # Table 5
         Experiment("c.modsem", stream="modsem"),
         Experiment("c.depthproj", stream="depthproj"),
         # beyond the paper: how large structures are, what they are painted on, how often they change, and the paper's
         # choice in all we differ in
         Experiment("c.fixed", scales=(1.0, 1.0)),
-        Experiment("c.mesh", upright=0.0),
+        Experiment("c.mesh", extruded=0.0),
         Experiment("c.once", fresh=False),
         Experiment("c.paper", scales=(1.0, 1.0), fresh=False, paper_start=True),
     )

@@ -19,11 +19,11 @@ from zerobev.common.errors import run_command
 from zerobev.common.parallel import cluster
 from zerobev.config import LABELS, SCALES, CameraConfig, Scale
 from zerobev.data.samples import (
-    DepthProjTuples,
-    ModSemTuples,
+    DepthProjSamples,
+    ModSemSamples,
     SemanticPass,
-    SemanticTuples,
-    SynthTuples,
+    SemanticSamples,
+    SynthSamples,
     ViewSet,
     collate,
     semantic_sample,
@@ -34,7 +34,7 @@ from zerobev.experiments.gallery import gallery_indices
 from zerobev.experiments.records import Record, RecordStore, git_revision, origin, peak_memory_mb
 from zerobev.experiments.registry import EXPERIMENTS, Experiment, experiment
 from zerobev.experiments.workspace import ROOT, Workspace, fingerprint
-from zerobev.geometry.projection import project
+from zerobev.geometry.projection import inverse_project
 from zerobev.models.backbone_weights import load_backbone
 from zerobev.models.base import BevModel
 from zerobev.models.variants import VARIANTS, build
@@ -94,7 +94,7 @@ def _config(experiment: Experiment, workspace: Workspace) -> dict[str, Any]:
         texture = workspace.texture_identity(experiment.texture(scale))
         config |= {"model": asdict(experiment.model(scale)), "backbone": _backbone(experiment.network, scale)}
         config |= {"train": asdict(scale.train), "texture": texture}
-        config |= {"blank": experiment.blank(scale), "upright": experiment.upright_share(scale)}
+        config |= {"blank": experiment.empty_fraction(scale), "upright": experiment.extruded_fraction(scale)}
     return config
 
 
@@ -150,7 +150,7 @@ def compute(experiment: Experiment, workspace: Workspace, seed: int, store: Reco
 
 def _projection(workspace: Workspace) -> Predictor:
     """Rows (a): P^-1 with the depth that the batch brings."""
-    return lambda batch: project(batch["zero"], batch["depth"], workspace.scale.camera) > 0
+    return lambda batch: inverse_project(batch["zero"], batch["depth"], workspace.scale.camera) > 0
 
 
 def train_run(experiment: Experiment, workspace: Workspace, seed: int, key: str) -> tuple[BevModel, History]:
@@ -189,12 +189,12 @@ def stream(experiment: Experiment, workspace: Workspace, part: str, depth: str, 
     """The tuples of a split that an experiment trains on; depth: "gt" or "predicted"."""
     views: ViewSet = DepthPretraining(workspace).views(part) if depth == "predicted" else workspace.views(part)
     scale = workspace.scale
-    common = (scale.camera, seed, scale.train.batch, experiment.blank(scale))
+    common = (scale.camera, seed, scale.train.batch, experiment.empty_fraction(scale))
     if experiment.stream == "synth":
         bank = workspace.bank(experiment.texture(scale))
-        return SynthTuples(views, bank, *common, experiment.fresh, experiment.upright_share(scale))
+        return SynthSamples(views, bank, *common, experiment.fresh, experiment.extruded_fraction(scale))
     kinds: dict[str, Callable[[ViewSet, CameraConfig, int, int, float], Source]]
-    kinds = {"modsem": ModSemTuples, "depthproj": DepthProjTuples, "classes": SemanticTuples}
+    kinds = {"modsem": ModSemSamples, "depthproj": DepthProjSamples, "classes": SemanticSamples}
     return kinds[experiment.stream](views, *common)
 
 

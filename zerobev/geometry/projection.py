@@ -51,7 +51,7 @@ def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
     return torch.where(on_map & seen, row * side + column, side * side)
 
 
-def project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
+def inverse_project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
     """P^-1 with max-pooling to the ground: a cell holds the largest value among the pixels that fall into it.
 
     Counting points in voxels, leaving out those above 2 m, summing over height and thresholding at zero
@@ -75,8 +75,8 @@ def project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> to
     return pooled[..., :-1].view(batch, modalities, side, side)
 
 
-def project_mask(mask: np.ndarray, depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
-    """P^-1 of one binary image: the cells that some white pixel falls into; as `project`, and several times faster.
+def inverse_project_mask(mask: np.ndarray, depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
+    """`inverse_project` of one binary image, several times faster: the cells that a white pixel falls into.
 
     mask: (H, W) bool; depth: (H, W) float, metres. Returns (M, M) bool.
     """
@@ -92,7 +92,7 @@ def fov_mask(depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
     cell in the mask, since the hull is that of the cells' corners.
     """
     side = camera.bev_px
-    on_map = project_mask(np.ones_like(depth, bool), depth, camera)
+    on_map = inverse_project_mask(np.ones_like(depth, bool), depth, camera)
     row = np.flatnonzero(on_map.any(axis=1))
     if not len(row):
         return np.zeros((side, side), bool)

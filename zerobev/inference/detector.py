@@ -34,11 +34,11 @@ class HubDetector:
         return cls(network, processor, str(source))
 
     @torch.inference_mode()
-    def detect(self, rgb: np.ndarray, least_score: float = 0.5) -> Boxes:
-        """The objects in a photograph (H, W, 3) uint8 with a score above `least_score`."""
+    def detect(self, rgb: np.ndarray, min_score: float = 0.5) -> Boxes:
+        """The objects in a photograph (H, W, 3) uint8 with a score above `min_score`."""
         inputs = self._processor(images=rgb, return_tensors="pt")
         outputs = self._network(**inputs)
-        (found,) = self._processor.post_process_object_detection(outputs, least_score, [rgb.shape[:2]])
+        (found,) = self._processor.post_process_object_detection(outputs, min_score, [rgb.shape[:2]])
         names = self._network.config.id2label
         labels = tuple(names.get(int(label), str(int(label))) for label in found["labels"])
         corners = found["boxes"].double().numpy()

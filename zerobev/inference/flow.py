@@ -51,10 +51,10 @@ class Flow:
         cls,
         field: np.ndarray,
         after: np.ndarray | None = None,
-        least_px: float = 1.0,
+        min_px: float = 1.0,
         spacing_px: int | None = None,
     ) -> Self:
-        """The vectors of a flow field that are longer than `least_px`, on a grid.
+        """The vectors of a flow field that are longer than `min_px`, on a grid.
 
         field: (H, W, 2) floating point, pixels to the right and down that each pixel moves
         spacing_px: of the grid; default: a 24th of the width
@@ -69,18 +69,18 @@ class Flow:
         rows, columns = (np.arange(step // 2, length, step) for length in field.shape[:2])
         x, y = np.meshgrid(columns, rows)
         vector = field[y, x].astype(np.float64)
-        moving = np.linalg.norm(vector, axis=-1) >= least_px
+        moving = np.linalg.norm(vector, axis=-1) >= min_px
         if not moving.any():
-            raise InputError(f"flow: expected a vector of {least_px:g} px at least, found none")
+            raise InputError(f"flow: expected a vector of {min_px:g} px at least, found none")
         start = np.stack([x, y], axis=-1)[moving] + 0.5
         return cls(start, start + vector[moving], after)
 
     @classmethod
     def between(
-        cls, first: np.ndarray, second: np.ndarray, method: str = "tvl1", least_px: float = 1.0, **grid: int | None
+        cls, first: np.ndarray, second: np.ndarray, method: str = "tvl1", min_px: float = 1.0, **grid: int | None
     ) -> Self:
         """The flow from one photograph to the next, (H, W, 3), with the second as `after`; see `flow_field`, `of`."""
-        return cls.of(flow_field(first, second, method), second, least_px, **grid)
+        return cls.of(flow_field(first, second, method), second, min_px, **grid)
 
     def discs(self, shape: tuple[int, int]) -> tuple[BinaryImages, BinaryImages]:
         """A filled circle at each start, and one at each end, in photographs of `shape` (H, W)."""

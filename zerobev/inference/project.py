@@ -22,7 +22,7 @@ from zerobev.inference.shipped_weights import ROWS
 _OPACITY = 0.5
 
 
-def read_photograph(path: Path) -> np.ndarray:
+def read_image(path: Path) -> np.ndarray:
     """(H, W, 3) uint8, turned upright as the camera noted; a file that is no image is an `InputError`."""
     return np.asarray(ImageOps.exif_transpose(_open(path)).convert("RGB"))
 
@@ -95,7 +95,7 @@ def main() -> None:
     if options.out.suffix.lower() != ".png":
         raise InputError(f"--out: expected a name that ends in .png, found {options.out}")
     plt.switch_backend("agg")  # no window is opened
-    rgb = read_photograph(options.image)
+    rgb = read_image(options.image)
     modality, names = _modality(options, rgb)
     shape = rgb.shape[:2]
     bev = load(options.row).project(rgb, modality, options.hfov, names)

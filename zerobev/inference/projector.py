@@ -11,7 +11,7 @@ from torch import Tensor
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
-from zerobev.geometry.projection import fov_mask, project
+from zerobev.geometry.projection import fov_mask, inverse_project
 from zerobev.inference.bev_map import BevArrows, BevMap
 from zerobev.inference.boxes import Boxes
 from zerobev.inference.flow import Flow
@@ -24,7 +24,7 @@ from zerobev.models.depth import DepthEstimator, DepthNet
 #: The row that is not trained: P^-1 with estimated depth.
 GEOMETRIC = "a.2"
 #: Binary images that one call takes; a network holds the features of all of them at once.
-MOST_IMAGES = 2048
+MAX_IMAGES = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +58,16 @@ class Projector:
         the image. Maps of empty masks are empty.
 
         Returns a `BevMap`, or `BevArrows` for flow. Raises `InputError` for wrong shapes, types or ranges, NaN, input
-        that is empty, and more than `MOST_IMAGES` binary images (real values are eight each).
+        that is empty, and more than `MAX_IMAGES` binary images (real values are eight each).
         """
-        photograph = checked_photograph(rgb)
+        photograph = checked_image(rgb)
         shape = photograph.shape[:2]
         if not isinstance(modality, Boxes | Flow):
             modality = _array(modality, "modality")
             if modality.shape == (*shape, 2):
                 modality = Flow.of(modality)
         if isinstance(modality, Flow):
-            after = photograph if modality.after is None else checked_photograph(modality.after)
+            after = photograph if modality.after is None else checked_image(modality.after)
             if after.shape != photograph.shape:
                 raise InputError(f"after: expected the first frame's shape {photograph.shape}, found {after.shape}")
             starts, ends = modality.discs(shape)
@@ -77,7 +77,7 @@ class Projector:
 
     def depth(self, rgb: np.ndarray, hfov_deg: float = 79.0) -> np.ndarray:
         """Estimated planar depth in the network's camera, (S, S) float32, metres; 0 where nothing is covered."""
-        photograph = checked_photograph(rgb)
+        photograph = checked_image(rgb)
         view = PinholeView(photograph.shape[:2], hfov_deg, self.camera)
         with torch.inference_mode():
             return self._depth(_batch(view.photograph(photograph)), view)[0, 0].numpy()
@@ -88,8 +88,8 @@ class Projector:
     @torch.inference_mode()
     def _maps(self, photograph: np.ndarray, images: BinaryImages, hfov_deg: float) -> BevMap:
         view = PinholeView(photograph.shape[:2], hfov_deg, self.camera)
-        if (count := len(images.labels) * images.levels) > MOST_IMAGES:
-            raise InputError(f"modality: expected {MOST_IMAGES} binary images at most, found {count}")
+        if (count := len(images.labels) * images.levels) > MAX_IMAGES:
+            raise InputError(f"modality: expected {MAX_IMAGES} binary images at most, found {count}")
         zero = torch.from_numpy(np.stack([view.mask(image) for image in images.images])).float()
         rgb = _batch(view.photograph(photograph))
         depth = self._depth(rgb, view)
@@ -104,7 +104,7 @@ class Projector:
     def _values_and_evidence(self, rgb: Tensor, zero: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Images (K, S, S) of one photograph -> (K, M, M) probabilities, and the rise of logits over an empty image."""
         if self.network is None:
-            values = project(zero[None], depth, self.camera)[0]
+            values = inverse_project(zero[None], depth, self.camera)[0]
             return values, values
         with_empty = torch.cat([zero, torch.zeros_like(zero[:1])])[None]
         logits = self.network(rgb, with_empty, depth).zero_logits[0]
@@ -117,7 +117,7 @@ class Projector:
         """
         depth = self.estimator(batch["rgb"])
         if self.network is None:
-            return project(batch["zero"], depth, self.camera) > 0.5
+            return inverse_project(batch["zero"], depth, self.camera) > 0.5
         return self.network(batch["rgb"], batch["zero"], depth).zero_logits > 0
 
 
@@ -141,7 +141,7 @@ def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None)
     return Projector(str(source), network.camera, network, depth)
 
 
-def checked_photograph(rgb: Any) -> np.ndarray:
+def checked_image(rgb: Any) -> np.ndarray:
     """(H, W, 3) uint8, or floating point in [0, 1] -> float32 in [0, 1]; all else is an `InputError`."""
     array = _array(rgb, "rgb")
     if array.ndim != 3 or array.shape[-1] != 3 or not array.size:

@@ -1,6 +1,6 @@
 """The networks: from a photograph and zero-shot images to maps."""
 
-from zerobev.models.base import BevModel, Projection
+from zerobev.models.base import BevModel, MapLogits
 from zerobev.models.tim import TIM
 from zerobev.models.two_streams import TwoStreamZeroBEV
 from zerobev.models.variants import VARIANTS, build, load_model
@@ -12,7 +12,7 @@ __all__ = [
     "VARIANTS",
     "VPN",
     "BevModel",
-    "Projection",
+    "MapLogits",
     "TwoStreamZeroBEV",
     "ZeroBEV",
     "build",

@@ -55,7 +55,7 @@ class MultiHeadAttention(nn.Module):
         nn.init.eye_(queries).mul_(weight)
         keys.copy_(queries)
 
-    def project(self, x: Tensor, position: Tensor, first: int, last: int) -> tuple[Tensor, ...]:
+    def qkv(self, x: Tensor, position: Tensor, first: int, last: int) -> tuple[Tensor, ...]:
         """Of (queries, keys, values) those from `first` to `last`: x (N, L, d) -> each (N, heads, L, d / heads)."""
         rows = slice(first * self.width, last * self.width)
         weight, bias = self.inputs.weight[rows], self.inputs.bias[rows]
@@ -71,11 +71,11 @@ class MultiHeadAttention(nn.Module):
 
     def within(self, x: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
         """Self-attention: x (N, L, d), position (L, d) -> (N, L, d), attention (N, heads, L, L)."""
-        return self.mix(*self.project(x, position, 0, 3))
+        return self.mix(*self.qkv(x, position, 0, 3))
 
     def across(self, x: Tensor, position: Tensor, memory: Tensor, memory_position: Tensor) -> tuple[Tensor, Tensor]:
         """Cross-attention of x (N or 1, P, d) to memory (N, R, d) -> (N, P, d), attention (N, heads, P, R)."""
-        return self.mix(*self.project(x, position, 0, 1), *self.project(memory, memory_position, 1, 3))
+        return self.mix(*self.qkv(x, position, 0, 1), *self.qkv(memory, memory_position, 1, 3))
 
 
 class FeedForward(nn.Sequential):

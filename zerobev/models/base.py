@@ -18,10 +18,10 @@ from zerobev.config import AUX, CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder
 
 #: Zero-shot images that pass a network together, at most (a batch with more samples passes whole).
-IMAGES_A_PASS = 16
+IMAGES_PER_PASS = 16
 
 
-class Projection(NamedTuple):
+class MapLogits(NamedTuple):
     """What a network predicts, before the FOV mask."""
 
     zero_logits: Tensor  #: (B, K, M, M): one map a zero-shot image, or one a class
@@ -32,7 +32,7 @@ class Projection(NamedTuple):
 class BevModel(nn.Module):
     """A network with its configuration.
 
-    Those that predict maps are called as `model(rgb, zero, depth)` and return a `Projection`; each reads what it needs
+    Those that predict maps are called as `model(rgb, zero, depth)` and return a `MapLogits`; each reads what it needs
     of rgb (B, 3, H, W) in [0, 1], zero (B, K, H, W) and depth (B, 1, H, W) in metres, all float32.
 
     Raises `InputError` for auxiliary maps that do not exist.

@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
-from zerobev.geometry.projection import project
+from zerobev.geometry.projection import inverse_project
 from zerobev.models.backbone import RgbEncoder
-from zerobev.models.base import IMAGES_A_PASS, BevModel, Projection
+from zerobev.models.base import IMAGES_PER_PASS, BevModel, MapLogits
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.polar import PolarToCartesian, floor_row
 from zerobev.models.pyramid import FeaturePyramid
@@ -87,11 +87,11 @@ class MaxPoolZeroBEV(BevModel):
         self.values = nn.Conv2d(model.width, model.width, 1)
         self.embedding = nn.Conv2d(2 if model.residual else 1, model.width, 1)
         with torch.no_grad():
-            self.embedding.weight.mul_(model.residual_gain)
+            self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> Projection:
-        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `Projection`.
+    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
+        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
         depth: (B, 1, H, W) metres, true or estimated; the residual variant alone reads it
         """
@@ -103,13 +103,13 @@ class MaxPoolZeroBEV(BevModel):
         seen = [pooled]
         if self.config.residual:
             assert depth is not None  # as checked
-            seen.append(project(zero, depth, self.camera))
+            seen.append(inverse_project(zero, depth, self.camera))
         known = self.map_features(features, gates)[:, None] + self.embedding(
             torch.stack(seen, dim=2).flatten(0, 1)
         ).unflatten(0, zero.shape[:2])
-        logits = torch.cat([self.decoder(part) for part in known.flatten(0, 1).split(max(len(zero), IMAGES_A_PASS))])
+        logits = torch.cat([self.decoder(part) for part in known.flatten(0, 1).split(max(len(zero), IMAGES_PER_PASS))])
         logits = logits.unflatten(0, zero.shape[:2])
-        return Projection(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None, pooled)
+        return MapLogits(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None, pooled)
 
     def map_features(self, features: Tensor, gates: Tensor) -> Tensor:
         """The photograph's features (B, d, R, C) on the map, (B, d, M, M): their mean, weighted with the gates."""

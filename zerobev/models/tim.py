@@ -9,7 +9,7 @@ from torch import Tensor
 from zerobev.config import LABELS, CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.base import BevModel, Projection
+from zerobev.models.base import BevModel, MapLogits
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev
 from zerobev.models.pyramid import FeaturePyramid
@@ -27,19 +27,19 @@ class TIM(BevModel):
         self.backbone = RgbEncoder(model)
         channels = model.channels
         if model.segmentation:
-            self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, len(LABELS), model.zero_gain)
+            self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, len(LABELS), model.zero_init_gain)
             channels = tuple(map(sum, zip(channels, model.zero_channels)))
         self.pyramid = FeaturePyramid(channels, model.width)
         self.bands = FpvToBev(camera, model)
         self.decoder = BevDecoder(model.width, model.decoder_channels, len(LABELS))
 
-    def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> Projection:
+    def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> MapLogits:
         """Photograph (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`.
 
         zero: (B, 8, H, W) masks of the classes in the order of `LABELS`; read with `segmentation` alone
         """
         features, _ = self.bands(self.fpv_maps(rgb, zero))
-        return Projection(self.decoder(features), None)
+        return MapLogits(self.decoder(features), None)
 
     def attention(self, rgb: Tensor, zero: Tensor | None = None) -> list[BandAttention]:
         """Attention of B photographs, near band first, laid out as `ZeroBEV.attention`."""

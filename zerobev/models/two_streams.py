@@ -12,7 +12,7 @@ from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.base import IMAGES_A_PASS, BevModel, Projection
+from zerobev.models.base import IMAGES_PER_PASS, BevModel, MapLogits
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev, reweigh
 from zerobev.models.pyramid import FeaturePyramid
@@ -35,23 +35,23 @@ class TwoStreamZeroBEV(BevModel):
         if not model.aux:
             raise InputError("aux: expected at least one map for the RGB stream to predict, found none")
         self.backbone = RgbEncoder(model)
-        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, gain=model.zero_gain)
+        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, gain=model.zero_init_gain)
         self.pyramid = FeaturePyramid(model.channels, model.width)
         self.bands = FpvToBev(camera, model)
         self.outs = nn.ModuleList(nn.Linear(c, model.width) for c in reversed(model.zero_channels))  # near band first
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> Projection:
-        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `Projection`."""
+    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
+        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `MapLogits`."""
         batch = self.check(rgb=(rgb, 3), zero=(zero, None))
         rgb_features, attention = self.bands(self.pyramid(self.backbone(rgb)))
         zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])[::-1]  # near band first
         zero_rays = [out(reweigh(band.cross[-1], m)) for out, band, m in zip(self.outs, attention, zero_maps)]
         zero_features = self.bands.to_map(zero_rays)
         # In training both streams pass together: one set of batch statistics, as in evaluation.
-        features = torch.cat([rgb_features, zero_features]).split(max(2 * batch, IMAGES_A_PASS))
+        features = torch.cat([rgb_features, zero_features]).split(max(2 * batch, IMAGES_PER_PASS))
         logits = torch.cat([self.decoder(part) for part in features])
-        return Projection(logits[batch:, 0].unflatten(0, zero.shape[:2]), logits[:batch, 1:])
+        return MapLogits(logits[batch:, 0].unflatten(0, zero.shape[:2]), logits[:batch, 1:])
 
     def attention(self, rgb: Tensor, zero: Tensor | None = None) -> list[BandAttention]:
         """Attention of B photographs, near band first, laid out as `ZeroBEV.attention`; no zero-shot image counts."""

@@ -37,8 +37,8 @@ VARIANTS: dict[str, tuple[type[BevModel], dict[str, Any]]] = {
 def build(row: str, camera: CameraConfig, model: ModelConfig) -> BevModel:
     """The network of a row, with random weights from torch's generator; an unknown row is an `InputError`.
 
-    Maps of a modality or a class start from `model.prior`, auxiliary maps from one half. White is rare: where a map
-    starts half white, the Dice loss of a rare class has its minimum at all white for hundreds of steps.
+    Maps of a modality or a class start from `model.foreground_prior`, auxiliary maps from one half. White is rare: if a
+    map starts half white, the Dice loss of a rare class has its minimum at all white for hundreds of steps.
     """
     if row not in VARIANTS:
         raise InputError(f"row: expected one of {', '.join(VARIANTS)}, found {row!r}")
@@ -46,7 +46,7 @@ def build(row: str, camera: CameraConfig, model: ModelConfig) -> BevModel:
     network = kind(camera, replace(model, **changes))
     bias = network.get_parameter("decoder.head.bias")
     with torch.no_grad():
-        bias[: len(bias) - len(network.config.aux)] += math.log(model.prior / (1 - model.prior))
+        bias[: len(bias) - len(network.config.aux)] += math.log(model.foreground_prior / (1 - model.foreground_prior))
     return network
 
 

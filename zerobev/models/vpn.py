@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from zerobev.config import LABELS, CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder
-from zerobev.models.base import BevModel, Projection
+from zerobev.models.base import BevModel, MapLogits
 from zerobev.models.decoder import convolution, upsample
 
 POOLED_SIDES = (1, 2, 3, 6)  #: of the pyramid pooling
@@ -51,10 +51,10 @@ class VPN(BevModel):
         )
         self.decoder = PyramidPooling(model.vpn_channels[-1], 2 * model.width, len(LABELS), model.dropout)
 
-    def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> Projection:
+    def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> MapLogits:
         """Photograph (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`."""
         self.check(rgb=(rgb, 3))
         features = self.backbone(rgb)[-1]
         from_above = self.view(features.flatten(2)).unflatten(2, features.shape[2:])
         size = (self.camera.bev_px, self.camera.bev_px)
-        return Projection(F.interpolate(self.decoder(from_above), size, mode="bilinear", align_corners=False), None)
+        return MapLogits(F.interpolate(self.decoder(from_above), size, mode="bilinear", align_corners=False), None)

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
-from zerobev.geometry.projection import project
+from zerobev.geometry.projection import inverse_project
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.base import IMAGES_A_PASS, BevModel, Projection
+from zerobev.models.base import IMAGES_PER_PASS, BevModel, MapLogits
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev
 from zerobev.models.pyramid import FeaturePyramid
@@ -32,17 +32,17 @@ class ZeroBEV(BevModel):
     def __init__(self, camera: CameraConfig, model: ModelConfig):
         super().__init__(camera, model)
         self.backbone = RgbEncoder(model)
-        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, gain=model.zero_gain)
+        self.zero_cnn = ZeroCNN(model.zero_channels, model.stem_stride, gain=model.zero_init_gain)
         self.pyramid = FeaturePyramid(tuple(map(sum, zip(model.channels, model.zero_channels))), model.width)
         self.bands = FpvToBev(camera, model)
         if model.residual:
             self.embedding = nn.Conv2d(1, model.width, 1)
             with torch.no_grad():
-                self.embedding.weight.mul_(model.residual_gain)
+                self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> Projection:
-        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `Projection`.
+    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
+        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
         depth: (B, 1, H, W) metres, true or estimated; the residual variant alone reads it
         """
@@ -50,11 +50,11 @@ class ZeroBEV(BevModel):
         images = [zero]  # and what else belongs to each of them
         if self.config.residual:
             assert depth is not None  # as checked
-            images.append(project(zero, depth, self.camera))
+            images.append(inverse_project(zero, depth, self.camera))
         rgb_maps = self.backbone(rgb)
-        parts = zip(*(image.split(max(1, IMAGES_A_PASS // len(zero)), dim=1) for image in images))
+        parts = zip(*(image.split(max(1, IMAGES_PER_PASS // len(zero)), dim=1) for image in images))
         logits = torch.cat([self.pass_images(rgb_maps, *part) for part in parts], dim=1)  # B K 1+aux M M
-        return Projection(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None)
+        return MapLogits(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None)
 
     def pass_images(self, rgb_maps: Sequence[Tensor], zero: Tensor, projected: Tensor | None = None) -> Tensor:
         """Maps of B photographs, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).

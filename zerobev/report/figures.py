@@ -101,7 +101,7 @@ def add_legend(figure: Figure) -> None:
     figure.legend(handles=patches, loc="lower center", ncols=len(LABELS), fontsize=7, bbox_to_anchor=(0.5, -0.04))
 
 
-def plan(scene: Scene, cell_m: float = 0.05) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+def top_view(scene: Scene, cell_m: float = 0.05) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """The whole home from above: (M, M) int8 labels, and the `extent` in world metres for `imshow`."""
     low, high = scene.vertices[:, :2].min(axis=0), scene.vertices[:, :2].max(axis=0)
     side_m = float((high - low).max())

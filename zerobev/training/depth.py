@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
-from zerobev.data.samples import ViewOrder, ViewSet
+from zerobev.data.samples import ViewSampler, ViewSet
 from zerobev.models.depth import DepthEstimator
 from zerobev.training.history import History
 from zerobev.training.losses import Losses
@@ -22,7 +22,7 @@ Batch = Mapping[str, Tensor]
 _BATCH = 32  # photographs that are estimated together
 
 
-class DepthTuples:
+class DepthSamples:
     """Endless pairs of photograph and depth; half of them mirrored, since a mirrored home is a home.
 
     Sample i is a function of (seed, i) alone. Each pass over the views is in a new random order.
@@ -30,7 +30,7 @@ class DepthTuples:
 
     def __init__(self, views: ViewSet, seed: int, batch: int) -> None:
         self._views, self._seed, self._batch = views, seed, batch
-        self._order = ViewOrder(len(views), seed)
+        self._order = ViewSampler(len(views), seed)
 
     def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
         """`rgb` (B, 3, H, W) in [0, 1] and `depth` (B, 1, H, W) metres, of a training step."""
@@ -68,7 +68,7 @@ def train_depth(
     validation: all its views, unmirrored, are the validation set; the score is their mean absolute error, metres
     """
     held_out = [_views_batch(validation, first) for first in range(0, len(validation), _BATCH)]
-    data = DepthTuples(views, seed, config.batch)
+    data = DepthSamples(views, seed, config.batch)
     return train(model, data, held_out, config, folder, seed, key=key, objective=depth_objective, device=device)
 
 

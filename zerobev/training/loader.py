@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, Dataset
 from zerobev.common.errors import InputError
 
 #: More read no faster from one disk.
-_MOST_WORKERS = 16
+_MAX_WORKERS = 16
 
 Batch = Mapping[str, Tensor]
 
@@ -87,4 +87,4 @@ def moved(batch: Batch, device: torch.device) -> Batch:
 def gpu_workers() -> int:
     """Workers beside a training on a GPU: the cores that each of this machine's trainings has beside its own."""
     trainings = int(os.environ.get("LOCAL_WORLD_SIZE", 1))  # as `accelerate launch` says
-    return min(max(joblib.cpu_count() // trainings - 1, 1), _MOST_WORKERS)
+    return min(max(joblib.cpu_count() // trainings - 1, 1), _MAX_WORKERS)

@@ -12,7 +12,7 @@ from zerobev.config import AUX
 EPSILON = 1e-6  #: keeps the Dice ratio of an empty class finite
 
 
-class Projection(Protocol):
+class Predicted(Protocol):
     """What a model returns: logits before the FOV mask."""
 
     zero_logits: Tensor  #: (B, K, M, M)
@@ -54,26 +54,26 @@ def dice_loss(probabilities: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
 
 def zero_bev_loss(
-    projection: Projection, batch: Mapping[str, Tensor], alpha: float, aux: tuple[str, ...] = AUX
+    predicted: Predicted, batch: Mapping[str, Tensor], alpha: float, aux: tuple[str, ...] = AUX
 ) -> Losses:
     """Dice loss of the main maps, and of the auxiliary maps with weight `alpha` where the model has them.
 
     Where the model shows its maps before the U-Net, their loss is added to the total, with the weight of the main maps:
     it reaches the geometry without a detour.
 
-    projection: logits (B, K, M, M) and, or None, (B, A, M, M), before the FOV mask
+    predicted: logits (B, K, M, M) and, or None, (B, A, M, M), before the FOV mask
     batch: `target` (B, K, M, M), `aux` (B, 2, M, M) in the order of `AUX` if the model predicts it, `fov` (B, 1, M, M)
     alpha: weight of the auxiliary loss, in [0, 1]; without auxiliary maps the main loss stands alone
     aux: names of the A maps that the model predicts, its `config.aux`
     """
-    zero = dice_loss(projection.zero_logits.float().sigmoid(), batch["target"], batch["fov"])
+    zero = dice_loss(predicted.zero_logits.float().sigmoid(), batch["target"], batch["fov"])
     minimised = zero
-    if projection.pooled is not None:
-        minimised = zero + dice_loss(projection.pooled, batch["target"], batch["fov"])
-    if projection.aux_logits is None:
+    if predicted.pooled is not None:
+        minimised = zero + dice_loss(predicted.pooled, batch["target"], batch["fov"])
+    if predicted.aux_logits is None:
         return Losses(minimised, zero)
     true_aux = batch["aux"][:, [AUX.index(name) for name in aux]]
-    aux_loss = dice_loss(projection.aux_logits.float().sigmoid(), true_aux, batch["fov"])
+    aux_loss = dice_loss(predicted.aux_logits.float().sigmoid(), true_aux, batch["fov"])
     return Losses((1 - alpha) * minimised + alpha * aux_loss, zero, aux_loss)
 
 

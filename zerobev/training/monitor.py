@@ -37,7 +37,7 @@ def maps_figure(model: nn.Module, batch: Mapping[str, Tensor]) -> Figure:
 
     It is drawn without `report.grid` and its pyplot, which would show it in the notebook that trains.
 
-    model: returns a `Projection`; it is called as it is, in evaluation mode
+    model: returns a `MapLogits`; it is called as it is, in evaluation mode
     batch: of `data.samples`, on the model's device
     """
     some = {name: value[:_SHOWN] for name, value in batch.items()}

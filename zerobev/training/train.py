@@ -47,7 +47,7 @@ log = logging.getLogger("zerobev.train")
 
 
 def dice_objective(alpha: float, aux: tuple[str, ...] = AUX) -> Objective:
-    """The Zero-BEV loss of a model that is called as `model(rgb, zero, depth)` and returns a `Projection`.
+    """The Zero-BEV loss of a model that is called as `model(rgb, zero, depth)` and returns a `MapLogits`.
 
     aux: names of the auxiliary maps that the model predicts, if it predicts any; depth is given where a batch has it
     """

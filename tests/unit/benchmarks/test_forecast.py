@@ -12,7 +12,7 @@ from torch import nn
 from transformers import ResNetConfig, ResNetModel
 
 from zerobev.benchmarks import forecast as planning
-from zerobev.benchmarks.forecast import Network, Plan, kept_bytes, plan
+from zerobev.benchmarks.forecast import Network, Plan, plan, saved_bytes
 from zerobev.common.errors import InputError, run_command
 from zerobev.config import SCALES, SceneConfig, TextureConfig
 from zerobev.experiments.records import RecordStore
@@ -79,7 +79,7 @@ def test_what_a_network_keeps_by_hand():
     """Its input, and the output of the first layer once, although two layers keep it; not the weights."""
     net = nn.Sequential(nn.Linear(4, 8, bias=False), nn.ReLU(), nn.Linear(8, 2, bias=False))
     images = torch.rand(5, 4)
-    assert kept_bytes(lambda: net(images).sum(), net) == 4 * (5 * 4 + 5 * 8)
+    assert saved_bytes(lambda: net(images).sum(), net) == 4 * (5 * 4 + 5 * 8)
 
 
 def test_a_plan_foretells_the_views_and_sees_what_is_done(tmp_path, monkeypatch):

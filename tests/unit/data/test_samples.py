@@ -11,14 +11,14 @@ from scipy import ndimage
 from zerobev.common.errors import InputError
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.data.samples import (
-    DepthProjTuples,
-    ModSemTuples,
-    SemanticTuples,
-    SynthTuples,
-    TupleStream,
+    DepthProjSamples,
+    ModSemSamples,
+    SampleStream,
+    SemanticSamples,
+    SynthSamples,
     ViewSet,
     collate,
-    painted_from_above,
+    extruded_texels,
     semantic_batches,
     semantic_sample,
     view_sample,
@@ -26,7 +26,7 @@ from zerobev.data.samples import (
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import MODSEM_DRAWS, TextureBank
 from zerobev.data.views import View, ViewSource
-from zerobev.geometry.projection import cells_of_pixels, map_points, project
+from zerobev.geometry.projection import cells_of_pixels, inverse_project, map_points
 
 from support.scenes import build, furnished, room
 
@@ -61,10 +61,10 @@ def views(folder) -> ViewSet:
 
 def stream(
     name: str, views: ViewSet, bank: TextureBank, seed: int = 1, batch: int = 6, blank: float = 0.0
-) -> TupleStream:
+) -> SampleStream:
     if name in ("synth", "paper"):
-        return SynthTuples(views, bank, CAMERA, seed, batch, blank, fresh=name == "synth")
-    kind = {"modsem": ModSemTuples, "depth": DepthProjTuples, "semantic": SemanticTuples}[name]
+        return SynthSamples(views, bank, CAMERA, seed, batch, blank, fresh=name == "synth")
+    kind = {"modsem": ModSemSamples, "depth": DepthProjSamples, "semantic": SemanticSamples}[name]
     return kind(views, CAMERA, seed, batch, blank)
 
 
@@ -192,7 +192,7 @@ def test_in_the_papers_mode_a_scene_wears_one_texture(views, bank):
 @pytest.mark.parametrize("name", ["synth", "modsem", "depth"])
 def test_the_asked_share_of_samples_is_blank_on_both_sides(views, bank, name):
     """Blank samples are empty in the image and on the map; all others are those of a stream without blanks."""
-    plain, blanked = stream(name, views, bank), stream(name, views, bank, blank=0.3)
+    plain, blanked = stream(name, views, bank), stream(name, views, bank, empty_fraction=0.3)
     pairs = [(plain.sample(i), blanked.sample(i)) for i in range(200)]
     blank = [not (new["zero"].any() or new["target"].any()) and old["zero"].any() for old, new in pairs]
     assert 0.2 < np.mean(blank) < 0.4
@@ -224,7 +224,7 @@ def test_modsem_is_white_on_instances_alone(views, bank):
 
 def test_depth_proj_is_the_projection_of_its_rectangles(views, bank):
     batch = stream("depth", views, bank, batch=20).batch(0)
-    assert torch.equal(batch["target"], project(batch["zero"], batch["depth"], CAMERA))
+    assert torch.equal(batch["target"], inverse_project(batch["zero"], batch["depth"], CAMERA))
     assert (batch["target"] <= batch["fov"]).all()  # nothing is known that was not seen
     assert len({image.numpy().tobytes() for image in batch["zero"]}) == 20
 
@@ -259,7 +259,7 @@ def test_depth_may_be_replaced(views, bank, dtype):
         assert np.array_equal(view.depth, maps[scene][i - scene * COUNTS[0]])
         assert np.array_equal(view.rgb, given.rgb) and not np.array_equal(view.depth, given.depth)
     batch, given = (stream("depth", each, bank).batch(0) for each in (predicted, views))
-    assert torch.equal(batch["target"], project(batch["zero"], batch["depth"], CAMERA))
+    assert torch.equal(batch["target"], inverse_project(batch["zero"], batch["depth"], CAMERA))
     assert torch.equal(batch["zero"], given["zero"]) and not torch.equal(batch["target"], given["target"])
     with pytest.raises(InputError, match=r"depth maps: expected \[5, 3\] views a shard, found \[3, 5\]"):
         views.with_depth(maps[::-1])
@@ -341,7 +341,7 @@ def test_what_is_painted_from_above_wears_the_plan_all_along_the_vertical(views)
     for index in range(len(views)):
         shard, view = views.locate(index)
         chart = views.shards[shard].charts
-        fpv, bev = painted_from_above(view, CAMERA, chart)
+        fpv, bev = extruded_texels(view, CAMERA, chart)
         raised = bev[..., 0] == chart
         assert np.array_equal(raised, (view.bev_texel[..., 0] >= 0) & (view.bev_height > CAMERA.obstacle_m))
         assert np.array_equal(bev[~raised], view.bev_texel[~raised])
@@ -362,9 +362,9 @@ def test_what_is_painted_from_above_wears_the_plan_all_along_the_vertical(views)
 def test_a_plan_belongs_to_the_world_and_not_to_the_camera(views):
     _, view = views.locate(0)
     x, y, z, yaw = view.pose
-    turned = painted_from_above(replace(view, pose=np.array([x, y, z, yaw + np.pi / 2])), CAMERA, 9)[1]
-    moved = painted_from_above(replace(view, pose=np.array([x + 3, y - 2, z, yaw])), CAMERA, 9)[1]
-    bev = painted_from_above(view, CAMERA, 9)[1]
+    turned = extruded_texels(replace(view, pose=np.array([x, y, z, yaw + np.pi / 2])), CAMERA, 9)[1]
+    moved = extruded_texels(replace(view, pose=np.array([x + 3, y - 2, z, yaw])), CAMERA, 9)[1]
+    bev = extruded_texels(view, CAMERA, 9)[1]
     raised = bev[..., 0] == 9
     assert np.abs(moved[raised][:, 1:].astype(int) - bev[raised][:, 1:] - (300, -200)).max() <= 1
     first, last = np.argwhere(raised)[[0, -1]]
@@ -373,10 +373,12 @@ def test_a_plan_belongs_to_the_world_and_not_to_the_camera(views):
 
 
 def test_the_asked_share_of_samples_is_painted_from_above(views, bank):
-    plain, upright = (SynthTuples(views, bank, CAMERA, 1, 6, upright=share) for share in (0.0, 0.4))
+    plain, upright = (SynthSamples(views, bank, CAMERA, 1, 6, extruded_fraction=share) for share in (0.0, 0.4))
     changed = [not np.array_equal(plain.sample(i)["zero"], upright.sample(i)["zero"]) for i in range(200)]
     assert 0.3 < np.mean(changed) < 0.5
-    kept = SynthTuples(views, bank, CAMERA, 1, 6, fresh=False, upright=0.5)  # with one texture a scene, by scene
+    kept = SynthSamples(
+        views, bank, CAMERA, 1, 6, fresh=False, extruded_fraction=0.5
+    )  # with one texture a scene, by scene
     maps = {}
     for i in range(40):
         view = views_of_samples(views, [kept.sample(i)])[0]

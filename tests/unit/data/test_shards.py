@@ -157,8 +157,10 @@ def test_files_that_are_no_shard_of_this_camera(scene, views, tmp_path):
     with pytest.raises(InputError, match=r"a\.h5: expected views .*'hfov_deg': 60, .*found .*'hfov_deg': 79"):
         Shard(path, replace(CAMERA, hfov_deg=60), TEXTURE)
     with pytest.raises(InputError, match=r"a\.h5: expected views .*'modsem_share': 0.2.*found .*'modsem_share': 0.3"):
-        Shard(path, CAMERA, replace(TEXTURE, modsem_share=0.2))
-    assert len(Shard(path, CAMERA, replace(TEXTURE, share=0.1))) == VIEWS  # views know nothing of *Synth* textures
+        Shard(path, CAMERA, replace(TEXTURE, modsem_fraction=0.2))
+    assert (
+        len(Shard(path, CAMERA, replace(TEXTURE, white_fraction=0.1))) == VIEWS
+    )  # views know nothing of *Synth* textures
     whole = path.read_bytes()
     for length in (0, 100, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])

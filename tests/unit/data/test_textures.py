@@ -89,13 +89,13 @@ def test_kernels_have_their_shape():
 @settings(max_examples=8, deadline=None)
 def test_share_is_reached_and_structures_only_grow(seed):
     opened = opened_structures((256, 256), SMALL, SOURCES, np.random.default_rng(seed))
-    assert SMALL.opened_share <= opened.mean() <= 1.1 * SMALL.opened_share
+    assert SMALL.opened_fraction <= opened.mean() <= 1.1 * SMALL.opened_fraction
     for share in SHARES:
-        config = replace(SMALL, share=share)
+        config = replace(SMALL, white_fraction=share)
         texture = synth_texture((256, 256), config, SOURCES, np.random.default_rng(seed))
         assert abs(texture.mean() - share) < 0.0001
         assert texture[opened].all()
-    barely = synth_texture((256, 256), replace(SMALL, share=0.06), SOURCES, np.random.default_rng(seed))
+    barely = synth_texture((256, 256), replace(SMALL, white_fraction=0.06), SOURCES, np.random.default_rng(seed))
     assert not barely[~dilate(opened, kernel_runs("square", 31), wrap=True)].any()  # one dilation, cut short
 
 
@@ -148,7 +148,7 @@ def test_sources_without_usable_structure():
             return image
 
     rng = np.random.default_rng(0)
-    assert 0.05 <= opened_structures((256, 256), SMALL, Poor(), rng).mean() <= 1.1 * SMALL.opened_share
+    assert 0.05 <= opened_structures((256, 256), SMALL, Poor(), rng).mean() <= 1.1 * SMALL.opened_fraction
 
     class Blank(SourceImages):
         def draw(self, rng):
@@ -160,7 +160,7 @@ def test_sources_without_usable_structure():
 
 def test_shares_must_be_ordered():
     with pytest.raises(InputError, match=r"found 0.05 and 0.01"):
-        synth_texture((64, 64), replace(SMALL, share=0.01), SOURCES, np.random.default_rng(0))
+        synth_texture((64, 64), replace(SMALL, white_fraction=0.01), SOURCES, np.random.default_rng(0))
 
 
 # --- the bank
@@ -273,7 +273,7 @@ def test_textures_are_independent_of_any_fixed_image(bank):
     correlation = [np.corrcoef(image.ravel(), d.ravel())[0, 1] for d in draws if d.any()]
     assert abs(np.mean(correlation)) < 4 * np.std(correlation) / np.sqrt(len(correlation))
     assert np.std(correlation) > 0.05  # single draws do correlate by chance: the mean is what is at zero
-    assert abs(draws.mean() - SMALL.share) < 0.02 and draws.mean(axis=0).max() < 0.30
+    assert abs(draws.mean() - SMALL.white_fraction) < 0.02 and draws.mean(axis=0).max() < 0.30
 
 
 # --- Mod. Sem. and Depth proj.
@@ -293,7 +293,7 @@ def things(rng: np.random.Generator, gap: int) -> np.ndarray:
 def test_modsem_erodes_the_objects_to_the_share(seed, share, gap):
     rng = np.random.default_rng(seed)
     instances = things(rng, gap)
-    textures = modsem_textures(instances, replace(SMALL, modsem_share=share), rng, draws=3)
+    textures = modsem_textures(instances, replace(SMALL, modsem_fraction=share), rng, draws=3)
     assert textures.dtype == bool and textures.shape == (3, *instances.shape)
     assert len({texture.tobytes() for texture in textures}) == 3
     for texture in textures:
@@ -308,18 +308,18 @@ def test_modsem_erodes_the_objects_to_the_share(seed, share, gap):
 def test_modsem_of_charts_without_and_with_nothing_but_objects():
     rng = np.random.default_rng(0)
     for full in modsem_textures(np.ones((100, 200), np.uint16), SMALL, rng):
-        assert abs(full.mean() - SMALL.modsem_share) < 0.001
+        assert abs(full.mean() - SMALL.modsem_fraction) < 0.001
         assert full[50, 100] and not full[0].any()  # what is left is the middle
     few = np.zeros((100, 100), np.uint16)
     few[40:50, 40:50] = 7
-    assert np.array_equal(modsem_textures(few, replace(SMALL, modsem_share=1.0), rng, draws=1)[0], few > 0)
+    assert np.array_equal(modsem_textures(few, replace(SMALL, modsem_fraction=1.0), rng, draws=1)[0], few > 0)
     assert not modsem_textures(np.zeros((50, 60), np.uint16), SMALL, rng).any()
 
 
 def test_modsem_lies_between_two_erosions_of_each_object():
     rng = np.random.default_rng(4)
     instances = things(rng, 0)
-    config = replace(SMALL, kernel_px=(12, 12), modsem_share=0.55)  # one erosion leaves 70 %, two leave 50 %
+    config = replace(SMALL, kernel_px=(12, 12), modsem_fraction=0.55)  # one erosion leaves 70 %, two leave 50 %
     objects = [np.pad(instances == i, 1) for i in range(1, 13)]
     once, twice = (
         np.any([ndimage.binary_erosion(one, np.ones((side, side))) for one in objects], axis=0)[1:-1, 1:-1]

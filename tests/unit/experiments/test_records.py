@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as arrays
 
 from zerobev.common.errors import InputError
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.records import Record, RecordStore, git_revision, kept, origin
+from zerobev.experiments.records import Record, RecordStore, cached, git_revision, origin
 
 MAPS = np.random.default_rng(0).random((2, 8, 5, 5)) < 0.5
 
@@ -137,13 +137,13 @@ def test_what_is_kept_is_computed_once_for_each_identity(tmp_path):
         return {"value": made[-1], "spread": (0.5, 1.5)}
 
     # as JSON has it, in its order: a table made of it looks the same the first time and later
-    first, second = ([*kept(path, {"weights": "x"}, compute).items()] for _ in range(2))
+    first, second = ([*cached(path, {"weights": "x"}, compute).items()] for _ in range(2))
     assert first == second == [("spread", [0.5, 1.5]), ("value", 0)]
-    assert kept(path, {"weights": "y"}, compute)["value"] == 1
+    assert cached(path, {"weights": "y"}, compute)["value"] == 1
     assert made == [0, 1] and {"origin", "seconds"} <= set(json.loads(path.read_text()))
     path.write_text("{}")
     with pytest.raises(InputError, match=r"a\.json: expected a record, found KeyError"):
-        kept(path, {"weights": "y"}, compute)
+        cached(path, {"weights": "y"}, compute)
 
 
 def test_a_revision_is_dirty_where_the_code_was_changed(tmp_path):

@@ -18,7 +18,7 @@ from zerobev.experiments.registry import EXPERIMENTS, experiment
 from zerobev.experiments.runs import InTurn, recorded, records_of, run, run_key, stream, train_run
 from zerobev.experiments.spot_check import spot_check
 from zerobev.experiments.workspace import Workspace
-from zerobev.geometry.projection import project
+from zerobev.geometry.projection import inverse_project
 from zerobev.models import ZeroBEV
 from zerobev.models.variants import VARIANTS
 from zerobev.report.paper import TABLES
@@ -88,7 +88,7 @@ def test_projections_are_what_their_depth_says(workspace, row, predicted):
     for batch in semantic_batches(test, camera, batch=1):
         with torch.inference_mode():
             depth = estimator(batch["rgb"]).half().float() if predicted else batch["depth"]
-        found = project(batch["zero"], depth, camera)[0].numpy() > 0
+        found = inverse_project(batch["zero"], depth, camera)[0].numpy() > 0
         inside, truth = batch["fov"][0].numpy() > 0, batch["target"][0].numpy() > 0
         scene = int(batch["scene"])
         intersection[scene] += (found & truth & inside).sum(axis=(1, 2))
@@ -120,11 +120,13 @@ def test_the_papers_choices_are_one_row_away_from_ours(workspace):
     ours, paper = (runs._config(EXPERIMENTS[row], workspace) for row in ("c", "c.paper"))
     reduced = SCALES["reduced"]
     assert EXPERIMENTS["c.paper"].texture(reduced).scales == (1.0, 1.0) != EXPERIMENTS["c"].texture(reduced).scales
-    blank = {row: EXPERIMENTS[row].blank(reduced) for row in ("c", "c.paper", "b.2")}
+    blank = {row: EXPERIMENTS[row].empty_fraction(reduced) for row in ("c", "c.paper", "b.2")}
     assert blank["c"] > 0 == blank["c.paper"] == blank["b.2"]
-    upright = {row: EXPERIMENTS[row].upright_share(reduced) for row in ("c", "c.paper", "c.mesh")}
+    upright = {row: EXPERIMENTS[row].extruded_fraction(reduced) for row in ("c", "c.paper", "c.mesh")}
     assert upright["c"] > 0 == upright["c.paper"] == upright["c.mesh"]
-    assert EXPERIMENTS["c"].model(reduced).prior < 0.5 == EXPERIMENTS["c.paper"].model(reduced).prior
+    assert (
+        EXPERIMENTS["c"].model(reduced).foreground_prior < 0.5 == EXPERIMENTS["c.paper"].model(reduced).foreground_prior
+    )
     assert EXPERIMENTS["c"].model(reduced).ground_start and not EXPERIMENTS["c.paper"].model(reduced).ground_start
     assert ours["model"] == paper["model"]  # this scale's choices are the paper's already
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skimage.morphology import convex_hull_image
 
 from zerobev.config import CameraConfig
-from zerobev.geometry.projection import cells_of_pixels, fov_mask, map_points, project, project_mask
+from zerobev.geometry.projection import cells_of_pixels, fov_mask, inverse_project, inverse_project_mask, map_points
 
 CAMERA = CameraConfig(fpv_px=24, bev_px=20)
 NOWHERE = CAMERA.bev_px**2
@@ -97,7 +97,7 @@ def voxel_projection(zero: np.ndarray, depth: np.ndarray, camera: CameraConfig, 
 def test_projection_is_counting_in_voxels(seed):
     zero, depth = random_view(seed, CAMERA)
     voxels = voxel_projection(zero.numpy(), depth.numpy(), CAMERA, side=20)
-    assert np.array_equal(project(zero, depth, CAMERA).numpy(), voxels)
+    assert np.array_equal(inverse_project(zero, depth, CAMERA).numpy(), voxels)
 
 
 @given(SEEDS)
@@ -107,13 +107,13 @@ def test_voxels_of_five_centimetres_make_no_difference_where_cells_are_whole_vox
     zero, depth = random_view(seed, CAMERA)
     fine = voxel_projection(zero.numpy(), depth.numpy(), CAMERA, side=100)
     pooled = fine.reshape(2, 3, 20, 5, 20, 5).max(axis=(3, 5))
-    assert np.array_equal(project(zero, depth, CAMERA).numpy(), pooled)
+    assert np.array_equal(inverse_project(zero, depth, CAMERA).numpy(), pooled)
 
     finer = replace(CAMERA, bev_px=40)
     cell_of_voxel = (np.arange(100) + 0.5) * 40 / 100
     whole = np.floor(cell_of_voxel - 0.2 + 1e-9) == np.floor(cell_of_voxel + 0.2 - 1e-9)
     assert whole.sum() == 80
-    direct, pooled = project(zero, depth, finer).numpy(), np.zeros((2, 3, 40, 40))
+    direct, pooled = inverse_project(zero, depth, finer).numpy(), np.zeros((2, 3, 40, 40))
     for row in np.flatnonzero(whole):
         for column in np.flatnonzero(whole):
             cell = pooled[..., int(cell_of_voxel[row]), int(cell_of_voxel[column])]
@@ -126,8 +126,8 @@ def test_voxels_of_five_centimetres_make_no_difference_where_cells_are_whole_vox
 def test_the_projection_of_one_mask_is_that_of_an_image(seed):
     zero, depth = random_view(seed, CAMERA)
     mask = zero[0, 0] > 0
-    expected = project(mask[None, None].double(), depth[:1], CAMERA)[0, 0].numpy()
-    found = project_mask(mask.numpy(), depth[0, 0].numpy(), CAMERA)
+    expected = inverse_project(mask[None, None].double(), depth[:1], CAMERA)[0, 0].numpy()
+    found = inverse_project_mask(mask.numpy(), depth[0, 0].numpy(), CAMERA)
     assert found.dtype == bool and np.array_equal(found, expected > 0)
 
 
@@ -138,15 +138,15 @@ def test_projection_is_a_maximum(seed):
     zero, depth = random_view(seed, CAMERA)
     generator = torch.Generator().manual_seed(seed)
     a, b = zero * torch.rand(zero.shape, generator=generator), torch.rand(zero.shape, generator=generator).double()
-    of_a, of_b = project(a, depth, CAMERA), project(b, depth, CAMERA)
-    assert torch.equal(project(torch.maximum(a, b), depth, CAMERA), torch.maximum(of_a, of_b))
-    assert torch.allclose(project(0.25 * a, depth, CAMERA), 0.25 * of_a)
-    assert (project(torch.maximum(a, b), depth, CAMERA) >= of_a).all()
+    of_a, of_b = inverse_project(a, depth, CAMERA), inverse_project(b, depth, CAMERA)
+    assert torch.equal(inverse_project(torch.maximum(a, b), depth, CAMERA), torch.maximum(of_a, of_b))
+    assert torch.allclose(inverse_project(0.25 * a, depth, CAMERA), 0.25 * of_a)
+    assert (inverse_project(torch.maximum(a, b), depth, CAMERA) >= of_a).all()
 
 
 def test_pixels_without_depth_reach_no_cell():
     zero = torch.ones(1, 1, 24, 24)
-    assert not project(zero, torch.zeros(1, 1, 24, 24), CAMERA).any()
+    assert not inverse_project(zero, torch.zeros(1, 1, 24, 24), CAMERA).any()
     assert (cells_of_pixels(torch.zeros(24, 24), CAMERA) == NOWHERE).all()
     assert not fov_mask(np.zeros((24, 24), np.float32), CAMERA).any()
 

@@ -199,14 +199,14 @@ def test_a_detector_from_a_folder_gives_boxes_in_pixels_of_the_photograph(tmp_pa
     seen = []
     detector = HubDetector.from_pretrained(tmp_path)
     detector._network.register_forward_hook(lambda module, args, outputs: seen.append(outputs))
-    boxes = detector.detect(rgb, least_score=0.0)
+    boxes = detector.detect(rgb, min_score=0.0)
     probability = seen[0].logits[0].softmax(-1)[:, :-1]
     x, y, width, height = seen[0].pred_boxes[0].numpy().T
     expected = np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1) * [96, 64, 96, 64]
     np.testing.assert_allclose(boxes.corners, expected, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(boxes.scores, probability.max(-1).values, rtol=1e-5)
     assert boxes.labels == tuple(("chair", "plant", "tv")[k] for k in probability.argmax(-1)) and len(boxes.labels) == 5
-    assert detector.detect(rgb, least_score=0.999).labels == ()
+    assert detector.detect(rgb, min_score=0.999).labels == ()
     with pytest.raises(InputError, match="expected an object detector"):
         HubDetector.from_pretrained(tmp_path / "nothing")
 

@@ -17,9 +17,9 @@ from zerobev.config import SCALES, CameraConfig
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.release import SCALE, halve, runs
 from zerobev.experiments.workspace import Workspace
-from zerobev.geometry.projection import project
+from zerobev.geometry.projection import inverse_project
 from zerobev.inference.images import LEVELS
-from zerobev.inference.project import main, read_labels, read_mask, read_photograph
+from zerobev.inference.project import main, read_image, read_labels, read_mask
 from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS, run_of, shipped
 from zerobev.models import build, load_model
 from zerobev.models.depth import DepthNet
@@ -160,7 +160,7 @@ def test_values_are_projected_level_by_level(rgb):
     values = np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
     bev = flat(2.0).project(rgb, values)
     rounded = torch.from_numpy(np.floor(values * LEVELS + 0.5) / LEVELS)[None, None]
-    expected = project(rounded.float(), torch.full((1, 1, SIDE, SIDE), 2.0), CAMERA)[0]
+    expected = inverse_project(rounded.float(), torch.full((1, 1, SIDE, SIDE), 2.0), CAMERA)[0]
     np.testing.assert_allclose(bev.values, expected, atol=1e-6)
 
 
@@ -270,7 +270,7 @@ def test_images_are_read_as_they_are_meant(tmp_path: Path):
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera was turned by 90 degrees
     Image.fromarray(upright).save(tmp_path / "turned.jpg", exif=exif)
-    assert read_photograph(tmp_path / "turned.jpg").shape == (8, 6, 3)
+    assert read_image(tmp_path / "turned.jpg").shape == (8, 6, 3)
     palette = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(6, 8) % 3, "P")
     palette.putpalette([0, 0, 0, 255, 0, 0, 0, 255, 0])
     palette.save(tmp_path / "labels.png")

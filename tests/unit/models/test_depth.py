@@ -24,7 +24,7 @@ from zerobev.data.views import View
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
 from zerobev.models.backbone_weights import load_backbone
 from zerobev.models.depth import FARTHEST_M, DepthNet, HubDepth
-from zerobev.training.depth import DepthErrors, DepthTuples, depth_errors, depth_objective, predict_depth, train_depth
+from zerobev.training.depth import DepthErrors, DepthSamples, depth_errors, depth_objective, predict_depth, train_depth
 
 SMOKE = SCALES["smoke"]
 
@@ -76,7 +76,7 @@ class Red(nn.Module):
 
 
 def test_photograph_and_depth_are_mirrored_together_half_of_the_time():
-    batch = DepthTuples(recorded(30, 34), seed=0, batch=64).batch(0)
+    batch = DepthSamples(recorded(30, 34), seed=0, batch=64).batch(0)
     torch.testing.assert_close(batch["depth"], batch["rgb"][:, :1] * 255 / 64)
     mirrored = batch["depth"][..., 0] > batch["depth"][..., -1]
     assert 20 < int(mirrored[:, 0, 0].sum()) < 44
@@ -85,14 +85,14 @@ def test_photograph_and_depth_are_mirrored_together_half_of_the_time():
 def test_every_pass_shows_every_view_once_in_another_order():
     views = recorded(5, 3)
     levels = sorted(float(views.locate(i)[1].depth.mean()) for i in range(8))
-    passes = [DepthTuples(views, seed=1, batch=8).batch(step)["depth"].mean(dim=(1, 2, 3)) for step in (0, 1)]
+    passes = [DepthSamples(views, seed=1, batch=8).batch(step)["depth"].mean(dim=(1, 2, 3)) for step in (0, 1)]
     assert not torch.equal(*passes)
     for shown in passes:
         np.testing.assert_allclose(np.sort(shown), levels, rtol=1e-6)
 
 
 def test_processes_share_a_batch():
-    data = DepthTuples(recorded(9), seed=3, batch=6)
+    data = DepthSamples(recorded(9), seed=3, batch=6)
     whole, parts = data.batch(2), [data.batch(2, rank, 2) for rank in (0, 1)]
     for name, tensor in whole.items():
         assert torch.equal(tensor[::2], parts[0][name]) and torch.equal(tensor[1::2], parts[1][name])

@@ -231,7 +231,7 @@ def test_residual_gain_scales_what_the_projection_adds():
     moved = []
     for gain in (1.0, 6.0):
         torch.manual_seed(0)
-        net = build("d", SCALES["smoke"].camera, replace(SCALES["smoke"].model, residual_gain=gain)).eval()
+        net = build("d", SCALES["smoke"].camera, replace(SCALES["smoke"].model, residual_init_gain=gain)).eval()
         seen = []
         net.decoder.register_forward_pre_hook(lambda module, features, seen=seen: seen.append(features[0]))
         with torch.inference_mode():

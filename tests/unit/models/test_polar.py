@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from zerobev.common.errors import InputError
 from zerobev.config import SCALES, CameraConfig
 from zerobev.geometry.cameras import Pose
-from zerobev.geometry.projection import cells_of_pixels, map_points, project
+from zerobev.geometry.projection import cells_of_pixels, inverse_project, map_points
 from zerobev.models.band_transformer import sinusoids
 from zerobev.models.fpv_to_bev import reweigh
 from zerobev.models.polar import PolarToCartesian, band_rows, floor_row
@@ -136,7 +136,7 @@ def test_true_correspondence_as_attention_gives_the_projection(band):
     attention = (member / member.sum(1, keepdim=True).clamp(min=1)).permute(2, 0, 1)  # C P R
     rays = reweigh(attention[:, None].expand(-1, 4, -1, -1), zero)
     found = PolarToCartesian(camera, rows, stride)(rays)[0].permute(0, 3, 1, 2)[0]  # 4 P M
-    expected = project(zero, depth[None, None], coarse)[0]
+    expected = inverse_project(zero, depth[None, None], coarse)[0]
 
     compared = []
     for p, row in enumerate(rows):

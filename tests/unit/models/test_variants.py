@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from zerobev.common.errors import InputError
 from zerobev.config import AUX, LABELS, SCALES, CameraConfig
-from zerobev.geometry.projection import map_points, project
+from zerobev.geometry.projection import inverse_project, map_points
 from zerobev.models import VARIANTS, BevModel, ZeroBEV, build, load_model
 from zerobev.models.fpv_to_bev import reweigh
 from zerobev.models.max_pooling import noisy_or
@@ -59,7 +59,7 @@ def test_maps_start_from_their_prior_and_auxiliary_maps_from_one_half(row):
     for prior in (0.5, 0.1):
         torch.manual_seed(0)
         with torch.no_grad():
-            results.append(network(row, prior=prior)(rgb, zero, depth))
+            results.append(network(row, foreground_prior=prior)(rgb, zero, depth))
     shift = torch.full_like(results[0].zero_logits, float(np.log(0.1 / 0.9)))
     assert torch.allclose(results[1].zero_logits - results[0].zero_logits, shift, atol=1e-5)
     if results[0].aux_logits is not None:
@@ -262,7 +262,7 @@ def test_the_residual_is_an_embedding_of_the_projection_added_to_the_map_feature
     net.decoder.register_forward_pre_hook(lambda _, features: seen.append(features[0]))
     net(rgb, zero, depth)
     features, _ = net.bands(net.pyramid(net.fpv_maps(net.backbone(rgb), zero)))
-    known = project(zero, depth, net.camera).flatten(0, 1)[:, None]  # N 1 M M
+    known = inverse_project(zero, depth, net.camera).flatten(0, 1)[:, None]  # N 1 M M
     assert 0.01 < known.mean() < 0.99
     weight, bias = net.embedding.weight[:, 0], net.embedding.bias[:, None, None]
     assert torch.allclose(seen[0], features + weight * known + bias, atol=1e-5)
@@ -354,7 +354,7 @@ def test_with_one_gate_a_pixel_the_pooled_map_is_the_projection():
     reached = row.permute(0, 2, 1)[:, :, None] == torch.arange(camera.bev_px)[:, None]  # B W P H
     pooled = noisy_or(torch.where(reached, 40.0, -40.0), batch["zero"].permute(0, 3, 2, 1))
     on_map = net.resample_pixels(pooled)[0][..., 0]
-    projected = project(batch["zero"], batch["depth"], camera)[:, 0]
+    projected = inverse_project(batch["zero"], batch["depth"], camera)[:, 0]
     inside = (batch["fov"][:, 0] > 0) & net.resample_pixels.valid
     assert ((on_map > 0.5) == (projected > 0.5))[inside].float().mean() > 0.9
 

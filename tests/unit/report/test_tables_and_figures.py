@@ -11,7 +11,7 @@ from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.evaluation.metrics import Counts
 from zerobev.experiments.records import Record
 from zerobev.report.claims import judge
-from zerobev.report.figures import COLORS, flat, label_image, maps_image, plan
+from zerobev.report.figures import COLORS, flat, label_image, maps_image, top_view
 from zerobev.report.own_rows import OWN_CLAIMS
 from zerobev.report.paper import CLAIMS, TABLES
 from zerobev.report.tables import Checks, scoreboard, table, verdict_table
@@ -118,7 +118,7 @@ def test_maps_are_drawn_like_labels_with_the_floor_below():
 
 
 def test_plan_shows_a_home_in_world_metres():
-    label, extent = plan(build([*room((6, 4, 2.5), corner=(1, -2, 0)), box("bed", (5, -1, 0), (6.5, 1, 0.5))]))
+    label, extent = top_view(build([*room((6, 4, 2.5), corner=(1, -2, 0)), box("bed", (5, -1, 0), (6.5, 1, 0.5))]))
     assert extent == pytest.approx((1, 7, -2, 4))
     side = label.shape[0]
     rows, columns = np.indices(label.shape)

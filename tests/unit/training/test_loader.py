@@ -11,7 +11,7 @@ import torch
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig, TextureConfig
-from zerobev.data.samples import SemanticPass, SynthTuples, ViewSet
+from zerobev.data.samples import SemanticPass, SynthSamples, ViewSet
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank
 from zerobev.data.views import ViewSource
@@ -36,9 +36,9 @@ def views(tmp_path_factory) -> ViewSet:
 
 
 @pytest.fixture(scope="module")
-def source(views) -> SynthTuples:
+def source(views) -> SynthSamples:
     tiles = np.random.default_rng(1).random((2, 64, 64)) < 0.2
-    return SynthTuples(views, TextureBank(tiles, TEXTURE), CAMERA, seed=3, batch=4, upright=0.5)
+    return SynthSamples(views, TextureBank(tiles, TEXTURE), CAMERA, seed=3, batch=4, extruded_fraction=0.5)
 
 
 def same(one: list, other: list) -> bool:
