@@ -6,8 +6,19 @@ not name here (field of view, map extent, Dice loss, alpha, Adam, batch 16) is t
 
 import math
 from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
 
 from zerobev.common.errors import InputError
+
+Split = Literal["train", "validation", "test"]
+#: Zero-shot stream of training; "classes" is not zero-shot (paper, Table 5 and Section 4).
+Stream = Literal["synth", "modsem", "depthproj", "classes"]
+#: Depth that a method reads.
+Depth = Literal["true", "estimated"]
+#: Residual block of the RGB backbone.
+Block = Literal["basic", "bottleneck"]
+
+SPLITS: tuple[Split, ...] = get_args(Split)
 
 #: The eight evaluated classes, in the column order of the paper's tables.
 LABELS = ("wall", "floor", "chair", "sofa", "bed", "plant", "toilet", "tv")
@@ -94,7 +105,7 @@ class ModelConfig:
     """Widths of the network (paper, supplement, "Architecture Details"); near band first in `ffn`."""
 
     width: int  #: channels of the pyramid, the transformers and the BEV features
-    block: str  #: residual block of the RGB backbone: "basic" or "bottleneck"
+    block: Block  #: residual block of the RGB backbone
     depths: tuple[int, ...]  #: residual blocks in each stage of the RGB backbone
     channels: tuple[int, ...]  #: output channels of each stage
     stem_channels: int
@@ -251,8 +262,14 @@ SCALES = {
 }
 
 
+def one_of(argument: str, value: Any, choices: Any) -> Any:
+    """`value`, if it is among `choices`, a `Literal` or a collection of names; else an `InputError` that lists them."""
+    names = get_args(choices) or tuple(choices)
+    if value not in names:
+        raise InputError(f"{argument}: expected one of {', '.join(names)}, found {value!r}")
+    return value
+
+
 def scale(name: str) -> Scale:
     """The scale called `name`; an unknown name is an `InputError` that lists the known ones."""
-    if name not in SCALES:
-        raise InputError(f"scale: expected one of {', '.join(SCALES)}, found {name!r}")
-    return SCALES[name]
+    return SCALES[one_of("scale", name, SCALES)]

@@ -1,7 +1,8 @@
 """Forecast of the time, memory and disk that a reproduction takes on this machine.
 
-Views of one home and samples of two trainings are measured, in about a minute; the rest is multiplication. These are
-estimates, for one process and one device: every network costs what that of row (c) does, and figures come on top.
+Reads what is recorded; writes nothing. Views of one home and samples of two trainings are measured, in about a minute;
+the rest is multiplication. The figures are estimates for one process and one device: every network is assumed to cost
+as much as that of row (c), and drawing the figures is left out.
 """
 
 import argparse
@@ -19,23 +20,22 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
-from zerobev.common.errors import InputError, run_command
-from zerobev.config import SCALES, Scale
+from zerobev.common.errors import InputError
+from zerobev.config import SCALES, SPLITS, Scale
 from zerobev.data.generate import shard_path
 from zerobev.data.samples import SynthSamples, ViewSet, collate, semantic_sample
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.views import ViewSource
-from zerobev.evaluation.evaluate import model_inputs
 from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.experiments.records import RecordStore, peak_memory_mb
+from zerobev.experiments.provenance import peak_memory_mb
 from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.experiments.runs import SEEDS, run_key
-from zerobev.experiments.workspace import Workspace, fingerprint
+from zerobev.experiments.runs import SEEDS, Run
+from zerobev.experiments.workspace import Workspace
 from zerobev.models import build
 from zerobev.models.depth import DepthNet
 from zerobev.scenes.hm3dsem import read_scene
 from zerobev.training.depth import DepthSamples, depth_objective
-from zerobev.training.loader import Source, gpu_workers
+from zerobev.training.loader import Source, gpu_workers, model_inputs
 from zerobev.training.train import Objective, dice_objective, training_accelerator
 
 _VIEWS, _SECONDS = 4, 4.0  # views that are stored and trained on; seconds in which they are counted
@@ -59,7 +59,7 @@ class Network:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Forecast:
     """What there is to do at a scale, and what it takes."""
 
     scale: Scale
@@ -127,31 +127,30 @@ class Plan:
         return "\n".join([f"scale {scale.name}, estimated:", *(f"  {name:<10} {text}" for name, text in rows.items())])
 
 
-def plan(workspace: Workspace) -> Plan:
+def forecast(workspace: Workspace) -> Forecast:
     """Measure one of each, and count what there is to do."""
-    scale, split, depth = workspace.scale, workspace.split, DepthPretraining(workspace)
-    homes = {"train": split.train, "validation": split.validation, "test": split.test}
-    shards = workspace.cache / f"views-{fingerprint(workspace.identity)}"
-    missing = [folder for part, of in homes.items() for folder in of if not shard_path(folder, shards / part).exists()]
-    networks, store = [e for e in EXPERIMENTS.values() if e.network], RecordStore(workspace.reports)
+    scale, folders, depth = workspace.scale, workspace.split, DepthPretraining(workspace)
+    homes, shards = {split: folders.of(split) for split in SPLITS}, workspace.views_folder
+    missing = [home for split, of in homes.items() for home in of if not shard_path(home, shards / split).exists()]
+    networks = [Run(experiment, workspace, SEEDS[0]) for experiment in EXPERIMENTS.values() if experiment.network]
     left = {
         "homes": len(missing),
-        "networks": sum(store.find(run_key(e, workspace, SEEDS[0])) is None for e in networks),
-        "estimators": int(not (workspace.reports / "depth.json").exists()),
+        "networks": sum(run.recorded() is None for run in networks),
+        "estimators": int(not depth.is_recorded),
     }
     there = [path for of in (shards, workspace.cache / depth.key, workspace.runs) for path in of.rglob("*")]
-    return Plan(
+    return Forecast(
         scale=scale,
-        homes={part: len(of) for part, of in homes.items()},
+        homes={split: len(of) for split, of in homes.items()},
         networks=len(networks),
         left=left,
         there_bytes=sum(path.stat().st_size for path in there if path.is_file()),
-        **measure(scale, split.train[0] if workspace.source else None),
+        **measure(scale, folders.train[0] if workspace.source else None),
     )
 
 
 def measure(scale: Scale, home: Path | None) -> dict[str, Any]:
-    """What a view and two networks take, fields of a `Plan`; of a home in HM3DSem layout, or of a generated one."""
+    """What a view and two networks take, fields of a `Forecast`; of a home in HM3DSem layout, or of a generated one."""
     threads, samples = torch.get_num_threads(), _SAMPLES[training_accelerator().device.type]
     with tempfile.TemporaryDirectory() as scratch:
         folder, path = home or home_folder(Path(scratch), 0), Path(scratch) / "views.h5"
@@ -219,24 +218,25 @@ def _gb(size: float) -> str:
     return f"{size / 1e9:,.1f} GB"
 
 
-def main() -> None:
-    """Parse the command line, print the plan; exit code 1 where it does not fit this machine."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.benchmarks.forecast", description=__doc__)
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)}")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev plan`."""
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
     parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
-    parser.add_argument("--textures", metavar="DIR", help="texture images for the zero-shot stream")
-    options = parser.parse_args()
+    parser.add_argument("--textures", type=Path, metavar="DIR", help="texture images for the zero-shot stream")
+    parser.add_argument(
+        "--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="values, such as train.steps=2400"
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print the forecast; an `InputError` if this machine has less disk or memory than needed."""
     if options.textures:
-        os.environ["ZEROBEV_TEXTURES"] = str(Path(options.textures).resolve())
-    workspace = Workspace(options.scale, options.scenes)
+        os.environ["ZEROBEV_TEXTURES"] = str(options.textures.resolve())
+    workspace = Workspace(options.scale, options.scenes, settings=options.set)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if torch.cuda.is_available():
         memory = torch.cuda.mem_get_info()[1]
     there = {"free disk": shutil.disk_usage(workspace.reports.parents[1]).free, "memory": memory}
-    found = plan(workspace)
+    found = forecast(workspace)
     print(found.table(there, os.cpu_count() or 1))
     found.check(there)
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -1,7 +1,8 @@
-"""What data, a training step and an inference cost: `python -m zerobev.benchmarks.run [--scale S] [--json FILE]`.
+"""Measure the cost of data, of a training step and of an inference.
 
-One run measures everything, in turns and with its spread. Milliseconds belong to a machine and a minute: what carries
-over are the ratios, to the machine's own peak of matrix products and between settings.
+Reads homes and views (made first if they are missing); prints a table and writes everything with `--json`. All settings
+are measured in turns and with their spread, so that machine noise hits all alike. Milliseconds belong to one machine at
+one time; ratios carry over: to the machine's own peak of matrix products, and between settings.
 """
 
 import argparse
@@ -19,11 +20,12 @@ from torch import Tensor
 
 from zerobev.benchmarks import data as generation
 from zerobev.benchmarks.training import Machine, Run, measure_paper_step, measure_training, training_step
-from zerobev.common.errors import run_command
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, Scale, scale
 from zerobev.data.samples import SynthSamples
-from zerobev.experiments.records import cached, peak_memory_mb
+from zerobev.experiments import versions
+from zerobev.experiments.provenance import peak_memory_mb
+from zerobev.experiments.records import recorded
 from zerobev.experiments.workspace import Workspace
 from zerobev.models import BevModel, build
 
@@ -31,7 +33,6 @@ MODALITIES = (1, 8, 40)  #: zero-shot images of one photograph
 ROWS = ("c", "e", "f")  #: that inference is measured of
 _SIZES = (0.5, 1.0, 2.0)  # of images and of maps, times the scale's
 _SCENES = (1, 4)
-_VERSION = 4  # raised by hand when what is measured changes
 
 
 def measure_inference(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
@@ -161,23 +162,22 @@ def table(measured: dict[str, Any]) -> list[str]:
 
 def recorded_benchmark(workspace: Workspace) -> dict[str, Any]:
     """The measurements of a report, `benchmark.json`: read where they are recorded, else taken now (some minutes)."""
-    identity = {"version": _VERSION, "scale": workspace.scale.name}
-    return cached(workspace.reports / "benchmark.json", identity, lambda: measure(workspace.scale, repeats=9))
+    config = {"version": versions.BENCHMARK, "scale": workspace.scale.name}
+    path = workspace.reports / "benchmark.json"
+    return recorded(path, "benchmark", config, lambda: measure(workspace.scale, repeats=9))
 
 
-def main() -> None:
-    """Measure, print the table, and write everything with `--json`."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.benchmarks.run", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev benchmark`."""
     parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--repeats", type=int, default=9, help="of which the median is taken (default: 9)")
+    parser.add_argument("--repeats", type=int, default=9, help="the median of these is taken (default: 9)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything measured to FILE")
-    options = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> None:
+    """Measure, print the table, and write everything with `--json`."""
     measured = measure(scale(options.scale), options.repeats)
     for line in table(measured):
         print(line)
     if options.json:
         write_json(options.json, measured)
-
-
-if __name__ == "__main__":
-    run_command(main)

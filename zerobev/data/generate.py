@@ -1,9 +1,10 @@
-"""Scenes -> shards: `python -m zerobev.data.generate --scenes DIR --out DIR --views N --scale S`.
+"""Record scenes as shards of views.
 
-One shard a scene, in parallel over scenes (`--workers`, or the workers of a dask cluster with `--dask`). A
-shard depends on the scene, the configuration, the number of views and the seed alone, so any number of
-workers writes the same bytes; a run that was killed goes on where it was, since a shard that is there is
-whole. `--verify` holds what is there against the manifest.
+Reads scenes in HM3DSem layout; writes `train/`, `validation/` and `test/` with a shard per scene and a manifest into
+`--out`. Scenes are spread over processes (`--workers`) or the workers of a dask cluster (`--dask`). A shard depends on
+the scene, the configuration, the number of views and the seed alone: any number of workers writes the same bytes. After
+an interruption the same command goes on, since every shard is written whole. `--verify` checks the shards against the
+manifest.
 """
 
 import argparse
@@ -17,17 +18,16 @@ from typing import Any
 import joblib
 import numpy as np
 
-from zerobev import config
-from zerobev.common.errors import InputError, run_command
+from zerobev.common.errors import InputError
+from zerobev.common.keys import matches, plain
 from zerobev.common.parallel import cluster, run_jobs
 from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
-from zerobev.config import CameraConfig, TextureConfig
+from zerobev.config import SCALES, SPLITS, CameraConfig, TextureConfig, scale
 from zerobev.data.shards import Shard, checksum, recorded_with, write_shard
 from zerobev.data.views import ViewSource
 from zerobev.scenes.hm3dsem import read_scene, split_scenes
 
-_PARTS = ("train", "validation", "test")
 _MANIFEST = "manifest.json"
 
 
@@ -92,7 +92,7 @@ def generate(
         for folder, outcome in found.items()
         if isinstance(outcome, str)
     }
-    write_json(out / _MANIFEST, {**run, "shards": listed | recorded})
+    write_json(out / _MANIFEST, {**plain(run), "shards": listed | recorded})
     return {folder.name: str(outcome) for folder, outcome in found.items() if isinstance(outcome, InputError)}
 
 
@@ -130,8 +130,8 @@ def _listed(out: Path, run: dict[str, Any]) -> dict[str, Any]:
         return {}
     manifest = _read_manifest(out)
     shards = manifest.pop("shards")
-    if manifest != run:
-        raise InputError(f"{path}: expected a manifest of {run}, found one of {manifest}")
+    if not matches(manifest, run):
+        raise InputError(f"{path}: expected a manifest of {plain(run)}, found one of {manifest}")
     return shards
 
 
@@ -184,38 +184,35 @@ def _read_manifest(out: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected a manifest of shards, found {found}") from None
 
 
-def main() -> None:
-    """Parse the command line; record, or verify, the shards of every split below `--out`."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.data.generate", description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the shards")
-    parser.add_argument("--scenes", type=Path, help="folder in HM3DSem layout")
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(config.SCALES)}")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev generate`."""
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the shards")
+    parser.add_argument("--scenes", type=Path, metavar="DIR", help="folder in HM3DSem layout")
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
     parser.add_argument("--views", type=int, help="per scene; default: the scale's")
     parser.add_argument("--seed", type=int, default=0)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=int, default=1, help="processes on this machine")
+    where.add_argument("--workers", type=int, default=1, help="processes on this machine (default: 1)")
     where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster that sees both folders")
     parser.add_argument("--verify", action="store_true", help="check the shards in --out instead")
-    options = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> None:
+    """Record, or verify, the shards of every split below `--out`; exit code 1 if a scene was skipped."""
     if options.verify:
-        problems = [problem for part in _PARTS for problem in verify(options.out / part)]
+        problems = [problem for split in SPLITS for problem in verify(options.out / split)]
         if problems:
             sys.exit("\n".join(problems))
         return
     if options.scenes is None:
-        parser.error("--scenes is required, except with --verify")
-    scale = config.scale(options.scale)
-    views = scale.scenes.views if options.views is None else options.views
-    split = split_scenes(options.scenes)
+        raise InputError("--scenes: expected a folder in HM3DSem layout, found none")
+    setting = scale(options.scale)
+    views = setting.scenes.views if options.views is None else options.views
+    found = split_scenes(options.scenes)
     broken: dict[str, str] = {}
     with cluster(options.dask):
-        for part in _PARTS:
-            folders = list(getattr(split, part))
-            out = options.out / part
-            broken |= generate(folders, out, views, scale.camera, scale.texture, options.seed, options.workers)
+        for split in SPLITS:
+            folders, out = list(found.of(split)), options.out / split
+            broken |= generate(folders, out, views, setting.camera, setting.texture, options.seed, options.workers)
     if broken:
         sys.exit("\n".join(f"skipped {name}: {message}" for name, message in broken.items()))
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import hdf5plugin
 import numpy as np
 
 from zerobev.common.errors import InputError
+from zerobev.common.keys import matches, plain
 from zerobev.common.storage import replacing
 from zerobev.config import CameraConfig, TextureConfig
 from zerobev.data.views import View
@@ -23,8 +24,8 @@ _FIELDS = tuple(field.name for field in fields(View))
 
 
 def recorded_with(camera: CameraConfig, texture: TextureConfig) -> dict[str, Any]:
-    """What views depend on beside their scene, as plain data: the camera, and the share of *Mod. Sem.* textures."""
-    return {"camera": asdict(camera), "modsem_share": texture.modsem_fraction}
+    """The settings that views depend on: the camera, and the white fraction of *Mod. Sem.* textures."""
+    return {"camera": camera, "modsem_share": texture.modsem_fraction}
 
 
 def write_shard(
@@ -45,7 +46,7 @@ def write_shard(
         file["instance_label"] = scene.instance_label
         file.attrs["scene"] = scene.name
         file.attrs["charts"] = len(scene.chart_instance)
-        file.attrs["recorded_with"] = json.dumps(recorded_with(camera, texture))
+        file.attrs["recorded_with"] = json.dumps(plain(recorded_with(camera, texture)))
         file.attrs["seed"] = seed
 
 
@@ -77,8 +78,8 @@ class Shard:
         except (OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: expected a shard of views, found {_short(error)}") from None
         expected = recorded_with(camera, texture)
-        if found != expected:
-            raise InputError(f"{path}: expected views recorded with {expected}, found {found}")
+        if not matches(found, expected):
+            raise InputError(f"{path}: expected views recorded with {plain(expected)}, found {found}")
         self._views: h5py.Dataset | None = None
         self._opened_by = 0  # the process; one that was forked off must not use the file of its parent
 

@@ -1,8 +1,8 @@
-"""The shipped weights on any homes: `python -m zerobev.evaluation.evaluate --scenes DIR [--views N] [--json FILE]`.
+"""Evaluate the shipped weights on a folder of homes.
 
-The networks were trained on generated homes alone, so every annotated scene of the folder is a test scene. Views are
-rendered on the spot. Rows as in Table 1: projection with true depth (a.1) and with estimated depth (a.2), and the
-networks that ship.
+Reads homes in HM3DSem layout; prints a table and writes it with `--json`. The networks were trained on generated homes
+alone, so every annotated scene of the folder is a test scene. Views are rendered on the spot. Rows as in Table 1: P^-1
+with true depth (a.1) and with estimated depth (a.2), and the networks that ship.
 """
 
 import argparse
@@ -83,14 +83,16 @@ def results_table(counts: dict[str, Counts]) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=["row", "method", *LABELS, "class avg.", "pixel avg."]).set_index("row")
 
 
-def main() -> None:
-    """Parse the command line, evaluate, print the table; exit code 1 if a scene was skipped."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.evaluation.evaluate", description=__doc__)
-    parser.add_argument("--scenes", type=Path, required=True, help="folder in HM3DSem layout; all its scenes are used")
-    parser.add_argument("--views", type=int, default=40, help="of each scene")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev evaluate`."""
+    parser.add_argument("--scenes", type=Path, required=True, metavar="DIR", help="folder in HM3DSem layout")
+    parser.add_argument("--views", type=int, default=40, help="per scene (default: 40)")
     parser.add_argument("--seed", type=int, default=0, help="of the poses")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write counts of every scene there")
-    options = parser.parse_args()
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the counts of every scene there")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Evaluate and print the table; exit code 1 if a scene was skipped."""
     found = find_scenes(options.scenes)
     by_name = {folder.name: folder for folders in found.values() for folder in folders}
     folders = [by_name[name] for name in sorted(by_name)]

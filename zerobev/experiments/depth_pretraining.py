@@ -1,10 +1,9 @@
 """The depth estimator of a scale: trained once, recorded, and used by every learned method.
 
-It serves twice. Its depth is that of the projection (a.2) and of the residual models; and the weights of its RGB
-backbone are where the backbone of every learned method starts, in place of ImageNet's.
+Its depth is that of the projection (a.2) and of the residual models; the weights of its RGB backbone are the first
+weights of every learned method's backbone, in place of ImageNet's.
 """
 
-import json
 import shutil
 import time
 from dataclasses import asdict
@@ -15,67 +14,74 @@ from typing import Any
 import numpy as np
 import torch
 
-from zerobev.common.errors import InputError
-from zerobev.common.storage import replacing, write_json
+from zerobev.common.keys import plain
+from zerobev.common.storage import replacing
+from zerobev.config import Split
 from zerobev.data.samples import ViewSet
-from zerobev.experiments.records import git_revision, is_fresh, origin, peak_memory_mb
-from zerobev.experiments.workspace import Workspace, fingerprint
+from zerobev.experiments import versions
+from zerobev.experiments.provenance import git_revision, origin, peak_memory_mb
+from zerobev.experiments.records import Record, find, key_of, write
+from zerobev.experiments.workspace import Workspace
 from zerobev.models.depth import DepthNet
 from zerobev.training.depth import depth_errors, predict_depth, train_depth
 from zerobev.training.distributed import rank_and_world_size
 
-#: Raised by hand whenever depth training changes what it computes.
-DEPTH_VERSION = 1
-
-#: What the network is made of, among the fields of `ModelConfig`.
+#: The fields of `ModelConfig` that the network is made of.
 _FIELDS = ("width", "block", "depths", "channels", "stem_channels", "stem_stride")
 
 _SEED = 0  # one estimator serves all seeds of all runs
 
 
 class DepthPretraining:
-    """The depth estimator of a workspace, read where it is recorded, else trained and kept.
+    """The depth estimator of a workspace: read if it is recorded, else trained and recorded.
 
-    Its record `reports/<scale>/depth.json` (key, configuration, errors on the test views, cost) and its weights beside
-    it are committed, so that nobody has to train it again; training that was killed goes on where it was.
+    Its record `reports/<scale>/depth.json` and its weights beside it are committed, so that nobody has to train it
+    again. With settings that change the estimator, both lie in the cache, and the committed ones stay.
     """
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
-        self._weights = workspace.reports / "depth.safetensors"
         scale = workspace.scale
         self.config: dict[str, Any] = {
-            "version": DEPTH_VERSION,
-            "data": workspace.identity,
+            "version": versions.DEPTH,
+            "data": workspace.data_config,
             "model": {name: getattr(scale.model, name) for name in _FIELDS},
-            "train": asdict(scale.depth),
+            "train": scale.depth,
         }
+        #: name of the run, with the fingerprint of its configuration
+        self.key = key_of(f"depth-seed{_SEED}", self.config)
+        self._folder = workspace.reports
+        if workspace.has_settings and self.key != DepthPretraining(workspace.without_settings()).key:
+            self._folder = workspace.runs / self.key
 
     @property
-    def key(self) -> str:
-        """Name of the run: the fingerprint of all it depends on is part of it."""
-        return f"depth-seed{_SEED}-{fingerprint(self.config)}"
+    def path(self) -> Path:
+        """The file of its record."""
+        return self._folder / "depth.json"
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether it need not be trained."""
+        return self._weights.exists() and find(self.path, Record, self.key, self.config) is not None
+
+    @property
+    def _weights(self) -> Path:
+        return self._folder / "depth.safetensors"
 
     @property
     def weights(self) -> Path:
-        """The file of its weights, trained now if it is not there."""
-        _ = self.record  # made now if there is none
+        """The file of its weights, trained now if it is missing."""
+        _ = self.record
         return self._weights
 
     @cached_property
-    def record(self) -> dict[str, Any]:
-        """What the run measured: `mad_m` and `relative` errors on the test views, cost, origin, training curves."""
-        path = self._workspace.reports / "depth.json"
-        if path.exists() and self._weights.exists() and is_fresh(path):
-            try:
-                found = json.loads(path.read_text())
-                if found["key"] == self.key:
-                    return found
-            except (ValueError, KeyError, TypeError) as error:
-                raise InputError(f"{path}: expected the record of a depth estimator, found {error}") from None
-        record = self._compute()
-        if rank_and_world_size()[0] == 0:
-            write_json(path, record)
+    def record(self) -> Record:
+        """Its record; the result: errors `mad_m` and `relative` on the test views, and the training curves."""
+        record = find(self.path, Record, self.key, self.config) if self._weights.exists() else None
+        if record is None:
+            record = self._compute()
+            if rank_and_world_size()[0] == 0:
+                write(self.path, record)
         return record
 
     @cached_property
@@ -83,10 +89,10 @@ class DepthPretraining:
         """The trained network, on the CPU, in evaluation mode."""
         return DepthNet.load(self.weights)
 
-    def views(self, part: str) -> ViewSet:
-        """The views of a split with predicted depth in place of the true one; it is predicted once and kept."""
-        views = self._workspace.views(part)
-        folder = self._workspace.cache / self.key / part
+    def views(self, split: Split) -> ViewSet:
+        """The views of a split with estimated depth in place of the true one; it is estimated once and cached."""
+        views = self._workspace.views(split)
+        folder = self._workspace.cache / self.key / split
         paths = [folder / f"{shard.path.stem}.npy" for shard in views.shards]
         for path, shard in zip(paths, views.shards):
             if not path.exists():
@@ -95,7 +101,7 @@ class DepthPretraining:
                     np.save(file, maps)
         return views.with_depth([np.load(path, mmap_mode="r") for path in paths])
 
-    def _compute(self) -> dict[str, Any]:
+    def _compute(self) -> Record:
         workspace, scale = self._workspace, self._workspace.scale
         revision = git_revision()
         torch.manual_seed(_SEED)
@@ -112,19 +118,17 @@ class DepthPretraining:
         trained = time.monotonic()
         device = next(network.parameters()).device.type
         errors = depth_errors(network, workspace.views("test"), device)
-        if rank_and_world_size()[0] == 0:  # of several processes
+        if rank_and_world_size()[0] == 0:
             network.cpu().save(self._weights)
-        shutil.rmtree(workspace.cache / self.key, ignore_errors=True)  # depth that earlier weights predicted
+        shutil.rmtree(workspace.cache / self.key, ignore_errors=True)  # depth estimated by earlier weights
         (workspace.runs / self.key / "checkpoint.pt").unlink(missing_ok=True)
-        return {
-            "key": self.key,
-            "config": self.config,
-            "origin": origin(device, revision),
-            "cost": {
-                "train_seconds": round(history.seconds, 1),
-                "evaluate_seconds": round(time.monotonic() - trained, 1),
-                "peak_memory_mb": peak_memory_mb(),
-            },
+        cost = {
+            "train_seconds": round(history.seconds, 1),
+            "evaluate_seconds": round(time.monotonic() - trained, 1),
+            "peak_memory_mb": peak_memory_mb(),
+        }
+        result = {
             "errors": {name: round(value, 4) for name, value in asdict(errors).items()},
             "history": history.curves(),
         }
+        return Record(self.key, plain(self.config), origin(device, revision), cost, result)

@@ -1,10 +1,11 @@
-"""The test views that every record keeps its predictions for, so that figures need no checkpoint."""
+"""The test views whose predictions every record keeps, so that figures need no checkpoint."""
 
 import numpy as np
 
+from zerobev.common.keys import fingerprint
 from zerobev.data.samples import ViewSet
-from zerobev.experiments.records import RecordStore
-from zerobev.experiments.workspace import Workspace, fingerprint
+from zerobev.experiments.run_records import RunStore
+from zerobev.experiments.workspace import Workspace
 
 GALLERY_VIEWS = 8
 
@@ -14,8 +15,8 @@ def gallery(workspace: Workspace) -> dict[str, np.ndarray]:
 
     rgb (N, H, H, 3) uint8; fpv_label (N, H, H) and bev_label (N, M, M) int8; fov (N, M, M) bool.
     """
-    store = RecordStore(workspace.reports)
-    name = f"views-{fingerprint(workspace.identity)}"
+    store = RunStore(workspace.reports)
+    name = f"views-{fingerprint(workspace.data_config)}"
     if (found := store.gallery(name)) is not None:
         return found
     views = workspace.views("test")

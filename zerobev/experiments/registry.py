@@ -1,38 +1,53 @@
-"""Which runs the tables need, as data; a row that stands in several tables is one run."""
+"""The runs of the tables, as data; a row that stands in several tables is one run."""
 
 from dataclasses import dataclass, replace
 
-from zerobev.common.errors import InputError
-from zerobev.config import ModelConfig, Scale, TextureConfig
+from zerobev.config import Depth, ModelConfig, Scale, Stream, TextureConfig, one_of
 from zerobev.models.variants import VARIANTS
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """One row of a table: a network trained on a stream, or the projection P^-1, which is not trained."""
+    """One row of a table: a network trained on a stream, or the projection P^-1, which is not trained.
+
+    Raises `InputError` for an unknown network, stream or depth.
+    """
 
     row: str
     network: str | None = "c"  #: a row of `models.variants.VARIANTS`; None for P^-1
-    stream: str = "synth"  #: zero-shot stream of training: "synth", "modsem", "depthproj", or "classes" (not zero-shot)
-    white_fraction: float = 0.20  #: of white texels (Synth)
+    stream: Stream = "synth"  #: zero-shot stream of training
+    white_fraction: float = 0.20  #: of the texels of *Synth* textures
     scales: tuple[float, float] | None = None  #: see `TextureConfig.scales`; None: those of the scale
-    fresh: bool = True  #: a new texture for every sample; else one a scene, as in the paper
+    fresh: bool = True  #: a new texture per sample; else one per scene, as in the paper
     extruded: float | None = None  #: see `Scale.extruded_fraction`; None: that of the scale
     paper_start: bool = False  #: as in the paper: no empty samples, no extruded textures, plain first weights
-    train_depth: tuple[str, ...] = ("gt",)  #: "gt" or "predicted", one stage of training after the other
-    test_depth: str = "predicted"  #: what P^-1 and the residual model get in the test
+    train_depth: tuple[Depth, ...] = ("true",)  #: of the stages of training, one after the other
+    test_depth: Depth = "estimated"  #: depth of P^-1 and of the residual model in the test
+
+    def __post_init__(self) -> None:
+        if self.network is not None:
+            one_of("network", self.network, VARIANTS)
+        one_of("stream", self.stream, Stream)
+        for depth in self.train_depth:
+            one_of("train_depth", depth, Depth)
+        one_of("test_depth", self.test_depth, Depth)
 
     @property
     def reads_depth(self) -> bool:
-        """Whether depth is among its inputs: else the two fields above mean nothing."""
+        """Whether depth is among its inputs; if not, `train_depth` and `test_depth` have no effect."""
         return self.network is None or VARIANTS[self.network][1].get("residual", False)
 
+    @property
+    def stages(self) -> tuple[Depth, ...]:
+        """Depth of each stage of training."""
+        return self.train_depth if self.reads_depth else ("true",)
+
     def texture(self, scale: Scale) -> TextureConfig:
-        """The textures that it is trained on."""
+        """The textures of its training."""
         return replace(scale.texture, white_fraction=self.white_fraction, scales=self.scales or scale.texture.scales)
 
     def model(self, scale: Scale) -> ModelConfig:
-        """The network's configuration; its variant is not yet part of it."""
+        """The network's configuration, before the changes of its variant."""
         if not self.paper_start:
             return scale.model
         return replace(
@@ -40,21 +55,21 @@ class Experiment:
         )
 
     def extruded_fraction(self, scale: Scale) -> float:
-        """The fraction of samples whose texture is extruded."""
+        """The fraction of samples with extruded textures."""
         if self.extruded is not None:
             return self.extruded
         return 0.0 if self.paper_start else scale.extruded_fraction
 
     def empty_fraction(self, scale: Scale) -> float:
-        """The fraction of empty samples. The masks of the classes need none: many are empty."""
+        """The fraction of empty samples; none with the masks of the classes, many of which are empty."""
         return 0.0 if self.paper_start or self.stream == "classes" else scale.empty_fraction
 
 
 def _experiments() -> dict[str, Experiment]:
-    stages = ("gt", "predicted")
+    stages: tuple[Depth, ...] = ("true", "estimated")
     rows = (
         # Table 1
-        Experiment("a.1", None, test_depth="gt"),
+        Experiment("a.1", None, test_depth="true"),
         Experiment("b.1", "b.1", stream="classes"),
         Experiment("b.2", "b.2", stream="classes"),
         Experiment("b.3", "b.3", stream="classes"),
@@ -71,7 +86,7 @@ def _experiments() -> dict[str, Experiment]:
         Experiment("f.r", "f.r", train_depth=stages),
         # Table 3
         Experiment("d.gt", "d"),
-        Experiment("d.predicted", "d", train_depth=("predicted",)),
+        Experiment("d.predicted", "d", train_depth=("estimated",)),
         # Table 4
         Experiment("c.10", white_fraction=0.10),
         Experiment("c.15", white_fraction=0.15),
@@ -80,8 +95,7 @@ def _experiments() -> dict[str, Experiment]:
         # Table 5
         Experiment("c.modsem", stream="modsem"),
         Experiment("c.depthproj", stream="depthproj"),
-        # beyond the paper: how large structures are, what they are painted on, how often they change, and the paper's
-        # choice in all we differ in
+        # not in the paper: size of structures, extrusion, freshness, and the paper's choice in all of them
         Experiment("c.fixed", scales=(1.0, 1.0)),
         Experiment("c.mesh", extruded=0.0),
         Experiment("c.once", fresh=False),
@@ -90,12 +104,10 @@ def _experiments() -> dict[str, Experiment]:
     return {experiment.row: experiment for experiment in rows}
 
 
-#: row -> run, in the order in which they are worth having
+#: row -> run, by priority
 EXPERIMENTS = _experiments()
 
 
 def experiment(row: str) -> Experiment:
     """The run of a row; an unknown row is an `InputError` that lists the known ones."""
-    if row not in EXPERIMENTS:
-        raise InputError(f"row: expected one of {', '.join(EXPERIMENTS)}, found {row!r}")
-    return EXPERIMENTS[row]
+    return EXPERIMENTS[one_of("row", row, EXPERIMENTS)]

@@ -1,8 +1,10 @@
-"""Making the shipped weights: the weights of recorded runs, in half precision, each file with the name of its run.
+"""Make the shipped weights: the weights of recorded runs, in half precision, each file with the name of its run.
 
+Reads the checkpoints of the runs in `.cache` (trained now if they are missing); writes `zerobev/inference/shipped/`.
 Half precision rounds the weights by less than a thousandth.
 """
 
+import argparse
 import json
 from pathlib import Path
 
@@ -12,9 +14,8 @@ from safetensors.torch import save_file
 
 from zerobev.common.errors import InputError
 from zerobev.common.storage import replacing
-from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.registry import experiment
-from zerobev.experiments.runs import run_key, train_run
+from zerobev.experiments.runs import Run
 from zerobev.experiments.workspace import Workspace
 from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS
 
@@ -26,7 +27,7 @@ _SEED = 0
 def halve(source: Path, target: Path, run: str) -> None:
     """Write the checkpoint `source` to `target` in half precision, with the name of its run.
 
-    Raises `InputError` where a weight is out of half precision's range.
+    Raises `InputError` if a weight is out of half precision's range.
     """
     with safe_open(source, framework="pt") as file:
         described = json.loads(file.metadata()["zerobev"])
@@ -42,21 +43,32 @@ def halve(source: Path, target: Path, run: str) -> None:
         temporary.chmod(0o644)
 
 
-def runs() -> dict[str, str]:
+def released_runs() -> dict[str, str]:
     """Name of the recorded run that each shipped file has to come from."""
-    workspace = Workspace(SCALE)
-    keys = {row: run_key(experiment(row), workspace, _SEED) for row in ROWS}
-    return keys | {DEPTH: DepthPretraining(workspace).key}
+    runs = _runs()
+    return {row: run.key for row, run in runs.items()} | {DEPTH: runs[ROWS[0]].pretraining.key}
 
 
 def write_weights(folder: Path = FOLDER) -> None:
     """Write the weights of all rows and of the depth estimator; missing ones are trained first."""
+    runs = _runs()
+    for row, run in runs.items():
+        if not run.weights.exists():
+            run.train()
+        halve(run.weights, folder / f"{row}.safetensors", run.key)
+    pretraining = runs[ROWS[0]].pretraining
+    halve(pretraining.weights, folder / f"{DEPTH}.safetensors", pretraining.key)
+
+
+def _runs() -> dict[str, Run]:
     workspace = Workspace(SCALE)
-    for name, key in runs().items():
-        if name == DEPTH:
-            trained = DepthPretraining(workspace).weights
-        else:
-            trained = workspace.runs / key / "model.safetensors"
-            if not trained.exists():
-                train_run(experiment(name), workspace, _SEED, key)
-        halve(trained, folder / f"{name}.safetensors", key)
+    return {row: Run(experiment(row), workspace, _SEED) for row in ROWS}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """`zerobev release` has no arguments."""
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the weights into the package."""
+    write_weights()

@@ -1,8 +1,9 @@
-"""Trust in records: one of them, drawn by date or named, is computed again and held against what was recorded.
+"""Compute one recorded run again and compare it with its record.
 
-`make reproduce` does this once everything is recorded, so that a change of behaviour is found even where the
-recipe version was not raised. A run on another machine differs in the last digits and then in the weights, so
-that the new averages have to lie in the recorded run's interval over test scenes, not to be equal.
+Reads the records in `reports/<scale>/`; writes nothing. The run is named, or chosen by the date. `make reproduce` ends
+with a spot check, so that a change of behaviour is found even if the recipe version was not raised. On another machine
+a run differs in the last digits and then in the weights: the new averages have to lie in the recorded run's interval
+over test scenes.
 """
 
 import argparse
@@ -14,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from zerobev import config
-from zerobev.common.errors import InputError, run_command
+from zerobev.common.errors import InputError
+from zerobev.config import SCALES
 from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
-from zerobev.experiments.records import Record, RecordStore
 from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.experiments.runs import compute, run_key
+from zerobev.experiments.run_records import RunRecord, RunStore
+from zerobev.experiments.runs import Run
 from zerobev.experiments.workspace import Workspace
 
 _SEED = 0
@@ -29,8 +30,8 @@ _SEED = 0
 class SpotCheck:
     """A recorded run beside the same run computed now."""
 
-    recorded: Record
-    again: Record
+    recorded: RunRecord
+    again: RunRecord
 
     @property
     def agrees(self) -> bool:
@@ -55,32 +56,29 @@ def spot_check(workspace: Workspace, row: str | None = None, day: date | None = 
     row: one of `EXPERIMENTS`; by default the recorded rows take turns, a day each (`day` is today if not given).
     Raises `InputError` for a row that has no record.
     """
-    store = RecordStore(workspace.reports)
-    found = {e: store.find(run_key(e, workspace, _SEED)) for e in EXPERIMENTS.values()}
-    recorded = {experiment.row: (experiment, record) for experiment, record in found.items() if record is not None}
+    runs = {row: Run(experiment, workspace, _SEED) for row, experiment in EXPERIMENTS.items()}
+    recorded = {row: record for row, run in runs.items() if (record := run.recorded()) is not None}
     rows = list(recorded)
     if not rows or (row is not None and row not in rows):
         raise InputError(f"spot check: expected one of the recorded rows {', '.join(rows) or '(none)'}, found {row!r}")
-    experiment, record = recorded[row or rows[(day or date.today()).toordinal() % len(rows)]]
+    chosen = row or rows[(day or date.today()).toordinal() % len(rows)]
     with tempfile.TemporaryDirectory() as scratch:
-        again = compute(experiment, workspace, _SEED, RecordStore(Path(scratch)))
-    return SpotCheck(record, again)
+        again = runs[chosen].compute(RunStore(Path(scratch)))
+    return SpotCheck(recorded[chosen], again)
 
 
-def main() -> None:
-    """Parse the command line, compute a recorded run again, say how it compares; exit code 1 if it does not agree."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.experiments.spot_check", description=__doc__)
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(config.SCALES)}")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev spot-check`."""
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
     parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
-    parser.add_argument("--row", metavar="ROW", help="a recorded row; default: they take turns, a day each")
-    options = parser.parse_args()
+    parser.add_argument("--row", metavar="ROW", help="a recorded row; default: a different one each day")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compute a recorded run again and print the comparison; exit code 1 if it does not agree."""
     workspace = Workspace(options.scale, options.scenes)
     print("spot check ...", flush=True)
     checked = spot_check(workspace, options.row)
     print(checked)
     if not checked.agrees:
         sys.exit(1)
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -1,6 +1,7 @@
-"""Your own image on a map: `python -m zerobev.inference.project IMAGE --masks M1.png M2.png --hfov 79 --out map.png`.
+"""Project masks, labels or boxes of an image to a map.
 
-Writes the photograph beside its map as PNG, and values, maps and metric grid as NPZ of the same name.
+Reads an image and its masks, labels or boxes, or runs a detector on it; writes the image beside its map as PNG, and
+values, maps and metric grid as NPZ of the same name.
 """
 
 import argparse
@@ -11,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from zerobev.common.errors import InputError, run_command
+from zerobev.common.errors import InputError
 from zerobev.common.storage import replacing
 from zerobev.inference import BevMap, Boxes, HubDetector, load
 from zerobev.inference.bev_map import color_of
@@ -79,19 +80,21 @@ def _modality(options: argparse.Namespace, rgb: np.ndarray) -> tuple[Any, list[s
     return np.stack(masks), [path.stem for path in options.masks]
 
 
-def main() -> None:
-    """Parse the command line, project, write the map."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.inference.project", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev project`."""
     parser.add_argument("image", type=Path, metavar="IMAGE", help="photograph, taken level, 0.88 m above the floor")
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--masks", type=Path, nargs="+", metavar="FILE", help="images that are black but for the mask")
+    what.add_argument("--masks", type=Path, nargs="+", metavar="FILE", help="images, black outside the mask")
     what.add_argument("--labels", type=Path, metavar="FILE", help="image of labels: grey values or palette indices")
     what.add_argument("--boxes", type=Path, metavar="FILE", help="CSV: xmin,ymin,xmax,ymax,label and perhaps score")
     what.add_argument("--detector", metavar="NAME", help="object detector of transformers: hub name or folder")
     parser.add_argument("--hfov", type=float, default=79.0, help="horizontal field of view, degrees; default 79")
     parser.add_argument("--row", default=ROWS[-1], help=f"one of {', '.join((GEOMETRIC, *ROWS))}, or a checkpoint")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="an NPZ is written beside it")
-    options = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> None:
+    """Project, write the map, and print where the things on it are."""
     if options.out.suffix.lower() != ".png":
         raise InputError(f"--out: expected a name that ends in .png, found {options.out}")
     plt.switch_backend("agg")  # no window is opened
@@ -105,7 +108,3 @@ def main() -> None:
         figure_of(rgb, images, bev).savefig(temporary, dpi=120)
     bev.save(options.out.with_suffix(".npz"))
     print(bev.footprints().round(2).to_string(index=False))
-
-
-if __name__ == "__main__":
-    run_command(main)

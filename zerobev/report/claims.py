@@ -12,7 +12,7 @@ import numpy as np
 from zerobev.common.errors import InputError
 from zerobev.config import LABELS
 from zerobev.evaluation.metrics import Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
-from zerobev.experiments.records import Record
+from zerobev.experiments.run_records import RunRecord
 from zerobev.report.paper import TABLES, Ordering, Ratio, Row, Similar
 
 _DRAWS = 1000
@@ -37,7 +37,7 @@ class Verdict:
     verdict: str  #: "holds", "does not hold", "undecided", or "not run"
 
 
-def judge(claim: Ordering | Similar, records: Sequence[Record]) -> Verdict:
+def judge(claim: Ordering | Similar, records: Sequence[RunRecord]) -> Verdict:
     """Whether a claim of the paper holds here too, or one of `zerobev.report.own_rows` at all.
 
     An ordering holds where the interval of the paired gain lies above zero, and does not where it lies below. Rows
@@ -64,7 +64,7 @@ def judge(claim: Ordering | Similar, records: Sequence[Record]) -> Verdict:
     return Verdict(claim.id, claim.table, text, paper, ours, low, high, verdict)
 
 
-def compare(ratio: Ratio, records: Sequence[Record]) -> dict[str, str | float | None]:
+def compare(ratio: Ratio, records: Sequence[RunRecord]) -> dict[str, str | float | None]:
     """A quotient of two rows in the paper and here, with our 90 % interval; None where a row was not run."""
     rows = (ratio.numerator, ratio.denominator)
     published = [_published(TABLES[1][row], ratio.metric) for row in rows]
@@ -87,7 +87,7 @@ def _named(claim: Ordering | Similar) -> str:
 
 
 def _measure(
-    rows: Sequence[str], metric: str, measure: Measure, records: Sequence[Record]
+    rows: Sequence[str], metric: str, measure: Measure, records: Sequence[RunRecord]
 ) -> tuple[float, float, float] | None:
     """The measured value and its interval; None where a row has no record."""
     runs = {row: [record for record in records if record.row == row] for row in rows}

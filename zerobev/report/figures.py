@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from zerobev.config import LABELS, CameraConfig
 from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
-from zerobev.experiments.records import Record
+from zerobev.experiments.run_records import RunRecord
 from zerobev.geometry.cameras import Pose
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.report.paper import TABLES
@@ -45,7 +45,7 @@ def flat(masks: np.ndarray) -> np.ndarray:
     return np.max(masks * grey[:, None, None], axis=0, initial=0)
 
 
-def averages_figure(number: int, records: Sequence[Record]) -> Figure:
+def averages_figure(number: int, records: Sequence[RunRecord]) -> Figure:
     """Both averages of each row of a table: ours with 90 % intervals over scenes and seeds, the paper's as crosses."""
     rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
     figure, panels = plt.subplots(1, 2, figsize=(8, 0.9 + 0.28 * len(rows)), sharey=True)
@@ -70,7 +70,7 @@ def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarra
     """Views of test homes, one a line: photograph, its labels, the maps of each row, and the truth.
 
     views: as `zerobev.experiments.gallery.gallery` returns them
-    maps: row -> (N, 8, M, M) bool, as `RecordStore.maps` returns them
+    maps: row -> (N, 8, M, M) bool, as `RunStore.maps` returns them
     """
     truth = [label_image(label, fov) for label, fov in zip(views["bev_label"], views["fov"])]
     predicted = [

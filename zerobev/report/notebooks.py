@@ -1,14 +1,13 @@
-"""The whole workbook in one command: `python -m zerobev.report.notebooks --scale reduced` (`make reproduce`).
+"""Run the whole workbook.
 
-Every notebook is executed in order with the scale and the scenes as its parameters, and kept, executed and as
-HTML, in `reports/<report>/notebooks/`. What a kernel says beside its outputs goes to `reports/<report>/logs/`.
-A run that was stopped is started again: the notebooks read what is already recorded.
+Reads `notebooks/` and the records of `reports/<report>/`. Every notebook is executed in order with the scale and the
+scenes as its parameters; the executed copies and their HTML go to `reports/<report>/notebooks/`, messages of kernels to
+`reports/<report>/logs/`. After an interruption the same command goes on: recorded results are read.
 """
 
 import argparse
 import base64
 import contextlib
-import fcntl
 import os
 import shutil
 import sys
@@ -19,14 +18,15 @@ from pathlib import Path
 
 import nbformat
 import papermill
+from filelock import FileLock, Timeout
 from nbclient.exceptions import DeadKernelError
 from nbconvert import HTMLExporter
 from nbformat import NotebookNode
 from papermill.exceptions import PapermillExecutionError
 
-from zerobev import config
-from zerobev.common.errors import InputError, run_command
+from zerobev.common.errors import InputError
 from zerobev.common.storage import replacing
+from zerobev.config import SCALES, one_of
 
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / ".cache"
@@ -84,12 +84,11 @@ def environment(variables: dict[str, str]) -> Iterator[None]:
 def only_run(logs: Path) -> Iterator[None]:
     """Hold the folder `logs` (made if missing) for this process; an `InputError` if another process holds it."""
     logs.mkdir(parents=True, exist_ok=True)
-    with (logs / ".lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{logs}: expected no other run of this report, found one at work") from None
-        yield
+    try:
+        with FileLock(logs / ".lock", blocking=False):
+            yield
+    except Timeout:
+        raise InputError(f"{logs}: expected no other run of this report, found one at work") from None
 
 
 @contextlib.contextmanager
@@ -215,7 +214,7 @@ def reproduce(
         `ZEROBEV_FRESH`, and take no record that is older.
     Raises `InputError` before anything is executed, `NotebookError` at the first notebook that fails.
     """
-    config.scale(scale)
+    one_of("scale", scale, SCALES)
     for name, folder in (("scenes", scenes), ("textures", textures)):
         if folder is not None and not folder.is_dir():
             raise InputError(
@@ -267,25 +266,23 @@ def refresh(notebooks: Path = ROOT / "notebooks", reports: Path = ROOT / "report
             file.write_bytes(picture)
 
 
-def main(**folders: Path) -> None:
-    """The command line; `folders` are `notebooks` and `reports` of `reproduce`."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.report.notebooks", description="Run the whole workbook.")
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--scale", help=f"{', '.join(config.SCALES)}: run it at this scale into reports/")
-    what.add_argument("--in-place", action="store_true", help="execute the committed notebooks again, in place")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev reproduce`."""
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("--scale", help=f"{', '.join(SCALES)}: run it at this scale into reports/")
+    which.add_argument("--in-place", action="store_true", help="execute the committed notebooks again, in place")
     parser.add_argument("--scenes", type=Path, metavar="DIR", help="HM3DSem scenes instead of generated homes")
     parser.add_argument("--textures", type=Path, metavar="DIR", help="texture images for the zero-shot stream")
     parser.add_argument("--fresh", action="store_true", help="compute again what is already recorded")
-    given = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the workbook at a scale, or execute the committed notebooks in place."""
     try:
-        if given.in_place:
-            refresh(**folders)
+        if options.in_place:
+            refresh()
         else:
-            report = reproduce(given.scale, given.scenes, given.textures, given.fresh, **folders)
+            report = reproduce(options.scale, options.scenes, options.textures, options.fresh)
             print(f"notebooks and their HTML: {report / 'notebooks'}")
     except NotebookError as error:
         sys.exit(f"\nerror: {error}")
-
-
-if __name__ == "__main__":
-    run_command(main)

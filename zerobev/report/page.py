@@ -1,7 +1,8 @@
-"""All tables, verdicts and figures of a report on one page: `python -m zerobev.report.page --scale reduced`.
+"""Write all tables, verdicts and figures of a report, and one page that shows them.
 
-Into `reports/<report>/` go `index.html`, readable without Jupyter, `tables/*.csv`, `claims.json`, `ratios.json` and
-`figures/*.png`. Records are read, nothing is computed: a row that was not run shows the paper's numbers alone.
+Reads the records of `reports/<report>/`; writes there `index.html`, readable without Jupyter, `tables/*.csv`,
+`claims.json`, `ratios.json` and `figures/*.png`. Nothing is computed: a row without a record shows the paper's numbers
+alone.
 """
 
 import argparse
@@ -21,12 +22,11 @@ import nbformat
 import pandas as pd
 from matplotlib.figure import Figure
 
-from zerobev import config
-from zerobev.common.errors import run_command
 from zerobev.common.storage import replacing, write_json
+from zerobev.config import SCALES
 from zerobev.experiments.gallery import gallery
-from zerobev.experiments.records import Record, RecordStore
 from zerobev.experiments.registry import EXPERIMENTS
+from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.experiments.runs import SEEDS, recorded
 from zerobev.experiments.workspace import ROOT, Workspace
 from zerobev.report.claims import Verdict, compare, judge
@@ -91,7 +91,7 @@ def write_summary(workspace: Workspace) -> Path:
     return page
 
 
-def _page(workspace: Workspace, records: Sequence[Record], sections: Sequence[str]) -> str:
+def _page(workspace: Workspace, records: Sequence[RunRecord], sections: Sequence[str]) -> str:
     camera, name = workspace.scale.camera, workspace.reports.name
     seeds = sorted({record.seed for record in records})
     return (
@@ -151,8 +151,8 @@ def _ratios(ratios: Sequence[dict[str, str | float | None]]) -> str:
     )
 
 
-def _gallery(workspace: Workspace, records: Sequence[Record]) -> str:
-    store = RecordStore(workspace.reports)
+def _gallery(workspace: Workspace, records: Sequence[RunRecord]) -> str:
+    store = RunStore(workspace.reports)
     keys = {record.row: record.key for record in records if record.seed == SEEDS[0]}
     shown = {row: store.maps(keys[row]) for row in _SHOWN if row in keys}
     if not shown:
@@ -201,14 +201,12 @@ def _css(verdict: str) -> str:
     return verdict.replace(" ", "-")
 
 
-def main() -> None:
-    """Parse the command line, write the page, say where it is."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.report.page", description=__doc__)
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(config.SCALES)}")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev summary`."""
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
     parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
-    options = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the page and print its path."""
     print(f"tables, verdicts and figures: {write_summary(Workspace(options.scale, options.scenes))}")
-
-
-if __name__ == "__main__":
-    run_command(main)

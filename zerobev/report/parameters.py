@@ -1,4 +1,7 @@
-"""`python -m zerobev.models --scale paper`: the parameters of every network, block by block, beside the paper's."""
+"""Count the parameters of every network, block by block, beside the paper's.
+
+Reads nothing; prints a table and writes the totals with `--json`.
+"""
 
 import argparse
 from pathlib import Path
@@ -6,7 +9,6 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from zerobev.common.errors import run_command
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, scale
 from zerobev.models.variants import VARIANTS, build
@@ -24,13 +26,15 @@ def parameters(network: nn.Module) -> dict[str, int]:
     return {**table, "total": sum(table.values())}
 
 
-def main() -> None:
-    """Print the table; with `--json`, write the total of every row too."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.models", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev parameters`."""
     parser.add_argument("--scale", default="paper", help=f"one of {', '.join(SCALES)} (default: paper)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write {row: parameters} to FILE")
-    arguments = parser.parse_args()
-    chosen = scale(arguments.scale)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print the table; with `--json`, write the total of every row too."""
+    chosen = scale(options.scale)
     with torch.device("meta"):  # shapes without memory
         tables = {row: parameters(build(row, chosen.camera, chosen.model)) for row in VARIANTS}
     print(f"{'row':<5}{'network':<17}" + "".join(f"{block:>12}" for block in BLOCKS) + f"{'paper':>9}")
@@ -39,9 +43,5 @@ def main() -> None:
         published = f"{PARAMETERS_M[row]:>7g} M" if row in PARAMETERS_M else ""
         print(f"{row:<5}{VARIANTS[row][0].__name__:<17}{counts}{published}")
     print("paper: Table 1, at scale paper; of (d) without the depth estimator")
-    if arguments.json:
-        write_json(arguments.json, {row: table["total"] for row, table in tables.items()})
-
-
-if __name__ == "__main__":
-    run_command(main)
+    if options.json:
+        write_json(options.json, {row: table["total"] for row, table in tables.items()})

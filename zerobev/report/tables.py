@@ -7,7 +7,7 @@ import pandas as pd
 from IPython.display import Markdown
 
 from zerobev.config import LABELS
-from zerobev.experiments.records import Record
+from zerobev.experiments.run_records import RunRecord
 from zerobev.report.claims import Verdict
 from zerobev.report.own_rows import OWN_ROWS
 from zerobev.report.paper import TABLES
@@ -26,7 +26,7 @@ NOTEBOOKS = {
 pd.set_option("display.max_colwidth", None)
 
 
-def table(number: int, records: Sequence[Record]) -> pd.DataFrame:
+def table(number: int, records: Sequence[RunRecord]) -> pd.DataFrame:
     """A table of the paper, its rows above ours, IoU in percent; ours are means over the records' seeds.
 
     Rows of `report.own_rows` follow. Rows without a record are shown with the paper's numbers alone, so that missing
@@ -51,7 +51,7 @@ def rows_of(number: int) -> dict[str, str]:
     return published | OWN_ROWS.get(number, {})
 
 
-def cost_table(records: Sequence[Record]) -> pd.DataFrame:
+def cost_table(records: Sequence[RunRecord]) -> pd.DataFrame:
     """Where numbers come from: seed, device, steps and seconds of each run, from its record."""
     columns = ["row", "seed", "device", "steps", "train [s]", "evaluate [s]", "memory [MB]", "test homes", "revision"]
     lines = [

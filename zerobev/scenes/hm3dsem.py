@@ -14,6 +14,7 @@ import trimesh
 from PIL import Image
 
 from zerobev.common.errors import InputError
+from zerobev.config import Split, one_of
 from zerobev.scenes.categories import label_of
 from zerobev.scenes.glb import RAW_UV, placed_meshes, read_glb
 from zerobev.scenes.scene import Instance, Scene
@@ -28,13 +29,17 @@ _LARGEST_SIDE = 32767  # of a texture: texels are kept as int16
 
 
 @dataclass(frozen=True)
-class Split:
+class SceneFolders:
     """Folders of the scenes for training, validation and test; each sorted by name."""
 
     train: tuple[Path, ...]
     validation: tuple[Path, ...]
     test: tuple[Path, ...]
     dealt: bool = False  #: not the official split: there were too few homes for it
+
+    def of(self, split: Split) -> tuple[Path, ...]:
+        """The folders of one split."""
+        return {"train": self.train, "validation": self.validation, "test": self.test}[one_of("split", split, Split)]
 
 
 def hash_of(folder: Path) -> str:
@@ -62,7 +67,7 @@ def find_scenes(root: Path) -> dict[str, list[Path]]:
     return found
 
 
-def split_scenes(root: Path) -> Split:
+def split_scenes(root: Path) -> SceneFolders:
     """Split the scenes of `root` as the paper does, or deal them out where that is not possible.
 
     The paper's split (section "Experimental Results"): training on `train`; validation on the four annotated
@@ -77,15 +82,15 @@ def split_scenes(root: Path) -> Split:
     names = {folder.name for folder in validation}
     test = [folder for folder in found["val"] if folder.name not in names]
     if found["train"] and validation and test:
-        return Split(tuple(found["train"]), tuple(validation), tuple(test), dealt=False)
+        return SceneFolders(tuple(found["train"]), tuple(validation), tuple(test), dealt=False)
     by_name = {folder.name: folder for split in _SPLITS for folder in found[split]}
     scenes = tuple(by_name[name] for name in sorted(by_name))
     if len(scenes) < 2:
         raise InputError(f"{root}: expected two annotated scenes at least, for training and for test, found one")
     tests = max(1, len(scenes) // 5)
     if len(scenes) == 2:
-        return Split(scenes[:1], scenes[:1], scenes[1:], dealt=True)
-    return Split(scenes[: -tests - 1], scenes[-tests - 1 : -tests], scenes[-tests:], dealt=True)
+        return SceneFolders(scenes[:1], scenes[:1], scenes[1:], dealt=True)
+    return SceneFolders(scenes[: -tests - 1], scenes[-tests - 1 : -tests], scenes[-tests:], dealt=True)
 
 
 def read_scene(folder: Path) -> Scene:

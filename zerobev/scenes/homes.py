@@ -1,7 +1,7 @@
-"""A data set of generated homes in HM3DSem layout: `python -m zerobev.scenes.homes --out DIR --scale S`.
+"""Write a data set of generated homes, in HM3DSem layout.
 
-Home number n of a seed is always the same home, whatever the scale, so that scales share their homes;
-each is written when it is first needed.
+Reads nothing; writes `train/`, `minival/` and `val/` with a folder per home into `--out`. Home number n of a seed is
+the same home at every scale; homes that are there already stay.
 """
 
 import argparse
@@ -10,11 +10,9 @@ from pathlib import Path
 import joblib
 import numpy as np
 
-from zerobev import config
-from zerobev.common.errors import run_command
 from zerobev.common.parallel import run_jobs
-from zerobev.config import SceneConfig
-from zerobev.scenes.hm3dsem import Split
+from zerobev.config import SCALES, SceneConfig, scale
+from zerobev.scenes.hm3dsem import SceneFolders
 from zerobev.scenes.hm3dsem_writer import write_dataset_config, write_scene
 from zerobev.scenes.indoor import generate_home
 
@@ -22,13 +20,14 @@ from zerobev.scenes.indoor import generate_home
 _FIRST = {"train": 0, "minival": 800, "val": 1000}
 
 
-def home_folders(root: Path, scenes: SceneConfig) -> Split:
+def home_folders(root: Path, scenes: SceneConfig) -> SceneFolders:
     """Where the homes of each split belong, written or not."""
 
     def folders(part: str, count: int) -> tuple[Path, ...]:
         return tuple(root / part / f"{n:05d}-Home{n:07d}" for n in range(_FIRST[part], _FIRST[part] + count))
 
-    return Split(folders("train", scenes.train), folders("minival", scenes.validation), folders("val", scenes.test))
+    train, validation = folders("train", scenes.train), folders("minival", scenes.validation)
+    return SceneFolders(train, validation, folders("val", scenes.test))
 
 
 def ensure_home(folder: Path, seed: int) -> Path:
@@ -48,19 +47,17 @@ def ensure_homes(folders: list[Path], seed: int, workers: int) -> None:
         pass
 
 
-def main() -> None:
-    """Parse the command line and write the homes of a scale."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.scenes.homes", description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder to write, in HM3DSem layout")
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(config.SCALES)}")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev homes`."""
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, in HM3DSem layout")
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=1)
-    options = parser.parse_args()
-    split = home_folders(options.out, config.scale(options.scale).scenes)
+    parser.add_argument("--workers", type=int, default=1, help="processes (default: 1)")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the homes of a scale."""
+    split = home_folders(options.out, scale(options.scale).scenes)
     folders = [*split.train, *split.validation, *split.test]
     ensure_homes(folders, options.seed, options.workers)
     write_dataset_config(options.out, folders)
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -1,0 +1,75 @@
+"""Compute one row of a table, or read it if it is recorded.
+
+Reads homes, views and textures (made first if they are missing, in `.cache`); writes the record to
+`reports/<scale>/records/` and its maps to `reports/<scale>/gallery/`. On several GPUs it is started by `accelerate
+launch`: the processes share training and evaluation, the first one writes.
+"""
+
+import argparse
+
+import torch
+from accelerate import PartialState
+from filelock import FileLock
+
+from zerobev.common.parallel import cluster
+from zerobev.config import SCALES, SPLITS, Split
+from zerobev.experiments.registry import EXPERIMENTS, experiment
+from zerobev.experiments.runs import Run
+from zerobev.experiments.workspace import Workspace
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `zerobev run`."""
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
+    parser.add_argument("--row", required=True, help=f"one of {', '.join(EXPERIMENTS)}")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    parser.add_argument(
+        "--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="values, such as train.steps=2400"
+    )
+    parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster that makes the views")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compute the record if it is missing, alone or beside other processes of a launch, and print its IoU."""
+    workspace = Workspace(options.scale, options.scenes, settings=options.set)
+    wanted = Run(experiment(options.row), workspace, options.seed)
+    with _one_at_a_time(workspace), cluster(options.dask):
+        _make_data(wanted)
+    # processes are joined only now: before, they would take each other's waiting for a failure
+    state = PartialState(cpu=not torch.cuda.is_available())
+    estimated = _estimated(wanted)
+    if estimated or (wanted.experiment.network and not wanted.backbone):
+        _ = wanted.pretraining.record  # trained by all, if it is missing
+        state.wait_for_everyone()
+        with _one_at_a_time(workspace):
+            for split in estimated:
+                wanted.pretraining.views(split)
+    record = wanted.record()
+    if state.is_main_process:
+        iou = f"class {100 * record.counts.class_iou():.2f}, pixel {100 * record.counts.pixel_iou():.2f}"
+        print(f"{wanted.store.path(record.key)}: IoU in percent: {iou}")
+    state.destroy_process_group()
+
+
+def _make_data(wanted: Run) -> None:
+    """The views, and the textures, of a run."""
+    for split in SPLITS:
+        wanted.workspace.views(split)
+    if wanted.experiment.network and wanted.experiment.stream == "synth":
+        wanted.workspace.bank(wanted.experiment.texture(wanted.workspace.scale))
+
+
+def _estimated(wanted: Run) -> list[Split]:
+    """The splits whose depth is estimated for a run."""
+    if not wanted.experiment.reads_depth:
+        return []
+    stages = wanted.experiment.stages
+    depths = {"train": stages, "validation": stages[-1:], "test": (wanted.experiment.test_depth,)}
+    return [split for split in SPLITS if "estimated" in depths[split]]
+
+
+def _one_at_a_time(workspace: Workspace) -> FileLock:
+    """A lock over all processes that see the cache: the first one makes the data that the others then find."""
+    workspace.cache.mkdir(parents=True, exist_ok=True)
+    return FileLock(workspace.cache / "data.lock")

@@ -1,0 +1,53 @@
+"""Where and with what a result is made: revision, versions, device, memory."""
+
+import os
+import platform
+import re
+import resource
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+_PACKAGES = ("torch", "numpy", "transformers", "accelerate", "embreex", "pyrender", "scikit-image")
+
+
+def git_revision(code: Path = Path(__file__).parents[1]) -> str:
+    """The commit that `code` is checked out at, with "-dirty" if it differs; "unknown" outside a checkout.
+
+    Only changes below `code` count: a reproduction writes reports and notebooks.
+    """
+    commands = ["describe", "--always", "--abbrev=12"], ["status", "--porcelain", "."]
+    try:
+        found = [subprocess.run(["git", *c], cwd=code, capture_output=True, text=True, check=False) for c in commands]
+    except FileNotFoundError:  # no git
+        return "unknown"
+    revision, changes = (ended.stdout.strip() for ended in found)
+    return (revision + "-dirty" if changes else revision) or "unknown"
+
+
+def origin(device: str, revision: str) -> dict[str, Any]:
+    """Revision, Python and library versions, device and number of cores, as plain data."""
+    return {
+        "revision": revision,
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in _PACKAGES},
+        "device": device,
+        "cores": os.cpu_count(),
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "none"
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, MB."""
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
+    if found:  # Linux; `getrusage` would count the parent process, too
+        return round(int(found[1]) / 1024, 1)
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
