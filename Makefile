@@ -36,13 +36,13 @@ reproduce: setup ## run the workbook [SCALE=smoke|reduced|paper SCENES=dir TEXTU
 	plan="$(filter-out 0,$(PLAN))"
 	if [ -n "$$TEXTURES" ]; then export ZEROBEV_TEXTURES="$$(realpath -m "$$TEXTURES")"; fi
 	if [ -n "$$plan" ] || [ "$$SCALE" = paper ]; then
-	    $(PYTHON) -m zerobev.benchmarks.forecast --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} $${TEXTURES:+--textures "$$TEXTURES"}
+	    $(PYTHON) -m zerobev plan --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} $${TEXTURES:+--textures "$$TEXTURES"}
 	fi
 	[ -z "$$plan" ] || exit 0
-	$(PYTHON) -m zerobev.report.notebooks --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
+	$(PYTHON) -m zerobev reproduce --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${TEXTURES:+--textures "$$TEXTURES"} $${fresh:+--fresh}
-	$(PYTHON) -m zerobev.report.page --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"}
-	[ -n "$$fresh" ] || $(PYTHON) -m zerobev.experiments.spot_check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
+	$(PYTHON) -m zerobev summary --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"}
+	[ -n "$$fresh" ] || $(PYTHON) -m zerobev spot-check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${SPOT:+--row "$$SPOT"}
 
 # Both at once: most of either computes on one core. What the notebooks say is printed whole, when they are through.
@@ -75,7 +75,7 @@ endef
 export OPEN_LAB
 
 notebooks: setup ## execute the committed notebooks again, in place
-	@$(PYTHON) -m zerobev.report.notebooks --in-place
+	@$(PYTHON) -m zerobev reproduce --in-place
 
 setup: $(RENDERER) ## install the pinned environment into .venv (the other targets do it when needed)
 

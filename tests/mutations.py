@@ -142,15 +142,15 @@ MUTATIONS = (
     Mutation(
         "trained on the test homes",
         "zerobev/experiments/runs.py",
-        'stream(experiment, workspace, "train", depth, seed)',
-        'stream(experiment, workspace, "test", depth, seed)',
+        'self.source("train", depth, self.seed)',
+        'self.source("test", depth, self.seed)',
         (f"{_RUNS}test_training_never_opens_a_test_scene",),
     ),
     Mutation(
         "validated on the test homes",
         "zerobev/experiments/runs.py",
-        'stream(experiment, workspace, "validation",',
-        'stream(experiment, workspace, "test",',
+        'self.source("validation",',
+        'self.source("test",',
         (f"{_RUNS}test_training_never_opens_a_test_scene",),
     ),
     # depth of (a.2)
@@ -158,14 +158,14 @@ MUTATIONS = (
         "true depth for (a.2), as configured",
         "zerobev/experiments/registry.py",
         'Experiment("a.2", None)',
-        'Experiment("a.2", None, test_depth="gt")',
+        'Experiment("a.2", None, test_depth="true")',
         (f"{_RUNS}test_every_row_of_every_table_is_a_run_and_each_run_is_one_row",),
     ),
     Mutation(
         "true depth for (a.2), as computed",
         "zerobev/experiments/runs.py",
-        'test = pretraining.views("test") if predicted else workspace.views("test")',
-        'test = workspace.views("test")',
+        'test = self.views("test", "estimated" if estimated else "true")',
+        'test = self.views("test", "true")',
         (f"{_RUNS}test_projections_are_what_their_depth_says",),
     ),
     # the theorem
@@ -186,8 +186,8 @@ MUTATIONS = (
     ),
     Mutation(
         "a benchmark of earlier code",
-        "zerobev/benchmarks/run.py",
-        re.compile(r"_VERSION = \d+"),
+        "zerobev/experiments/versions.py",
+        re.compile(r"BENCHMARK = \d+"),
         lambda match: f"{match[0]}0",
         ("tests/integrity/test_trust.py::test_what_is_measured_once_was_measured_by_this_code",),
     ),

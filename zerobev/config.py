@@ -28,6 +28,19 @@ NO_LABEL = -1
 AUX = ("obstacles", "navigable")
 
 
+def one_of(argument: str, value: Any, choices: Any) -> Any:
+    """`value`, if it is among `choices`, a `Literal` or a collection of names; else an `InputError` that lists them."""
+    names = get_args(choices) or tuple(choices)
+    if value not in names:
+        raise InputError(f"{argument}: expected one of {', '.join(names)}, found {value!r}")
+    return value
+
+
+def _require(name: str, value: float, holds: bool, expected: str) -> None:
+    if not holds:
+        raise InputError(f"{name}: expected {expected}, found {value:g}")
+
+
 @dataclass(frozen=True)
 class CameraConfig:
     """The pinhole FPV camera and the orthographic BEV map in front of it (paper, supplement, "Cameras").
@@ -44,6 +57,12 @@ class CameraConfig:
     bev_above_m: float = 2.0  #: height of the orthographic camera above the pinhole
     max_height_m: float = 2.0  #: points above this height (over the floor) do not reach the map
     obstacle_m: float = 0.10  #: a cell higher than this is an obstacle, else it is navigable
+
+    def __post_init__(self) -> None:
+        _require("fpv_px", self.fpv_px, self.fpv_px >= 1, "1 or more")
+        _require("bev_px", self.bev_px, self.bev_px >= 1, "1 or more")
+        _require("hfov_deg", self.hfov_deg, 0 < self.hfov_deg < 180, "more than 0 and less than 180")
+        _require("bev_extent_m", self.bev_extent_m, self.bev_extent_m > 0, "more than 0")
 
     @property
     def focal_px(self) -> float:
@@ -142,6 +161,13 @@ class TrainConfig:
     batch: int = 16
     alpha: float = 0.5  #: weight of the auxiliary loss
     weight_decay: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "decay_every", "validate_every", "batch"):
+            _require(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
+        _require("learning_rate", self.learning_rate, self.learning_rate > 0, "more than 0")
+        _require("decay", self.decay, 0 < self.decay <= 1, "more than 0 and at most 1")
+        _require("alpha", self.alpha, 0 <= self.alpha <= 1, "a value from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -260,14 +286,6 @@ SCALES = {
         ),
     )
 }
-
-
-def one_of(argument: str, value: Any, choices: Any) -> Any:
-    """`value`, if it is among `choices`, a `Literal` or a collection of names; else an `InputError` that lists them."""
-    names = get_args(choices) or tuple(choices)
-    if value not in names:
-        raise InputError(f"{argument}: expected one of {', '.join(names)}, found {value!r}")
-    return value
 
 
 def scale(name: str) -> Scale:

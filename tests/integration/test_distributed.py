@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +24,17 @@ import torch
 from dask.distributed import KilledWorker, LocalCluster
 from torch import nn
 
+from zerobev import cli
 from zerobev.common.parallel import cluster
 from zerobev.config import LABELS, SCALES, CameraConfig, SceneConfig, TextureConfig, TrainConfig
 from zerobev.data.generate import generate
 from zerobev.data.samples import semantic_batches
 from zerobev.evaluation.evaluate import evaluate, model_predictor
-from zerobev.experiments import runs
+from zerobev.experiments import launch as row_command
 from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.experiments.records import RecordStore
 from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.experiments.runs import run_key
+from zerobev.experiments.run_records import RunStore
+from zerobev.experiments.runs import Run
 from zerobev.experiments.workspace import Workspace
 from zerobev.models import ZeroBEV
 from zerobev.models import build as build_network
@@ -104,9 +106,9 @@ def train_frozen(folder: Path, killed_at: int | None = None) -> History:
 
 def objective(model: nn.Module, batch: dict[str, torch.Tensor]) -> Losses:
     """Dice, whose sums run over the processes, and a mean of the process's own samples, as that of depth."""
-    projection = model(*model_inputs(batch))
-    losses = zero_bev_loss(projection, batch, CONFIG.alpha)
-    own = (projection.zero_logits.sigmoid() - batch["target"]).square().mean()
+    predicted = model(*model_inputs(batch))
+    losses = zero_bev_loss(predicted, batch, CONFIG.alpha)
+    own = (predicted.zero_logits.sigmoid() - batch["target"]).square().mean()
     return Losses(losses.total + own, losses.main + own, losses.aux)
 
 
@@ -122,10 +124,10 @@ def main(folder: Path, how: str = "whole") -> None:
     if how == "alone":
         return
     SCALES["tiny"] = TINY
-    for kind, name in (RecordStore, "write"), (BevModel, "save"):
+    for kind, name in (RunStore, "write"), (BevModel, "save"):
         setattr(kind, name, noted(getattr(kind, name), folder / "written"))
-    sys.argv[1:] = ["--scale", "tiny", "--row", "d"]
-    runs.main(folder)
+    vars(row_command)["Workspace"] = partial(Workspace, root=folder)
+    cli.main(["run", "--scale", "tiny", "--row", "d"])
 
 
 def noted(write: Callable, notes: Path) -> Callable:
@@ -189,16 +191,16 @@ def test_two_processes_count_what_one_counts_and_the_first_writes(launched, monk
     folder, _ = launched
     monkeypatch.setitem(SCALES, "tiny", TINY)
     workspace = Workspace("tiny", root=folder)
-    key = run_key(EXPERIMENTS["d"], workspace, 0)
-    record = RecordStore(workspace.reports).find(key)
-    predict = model_predictor(ZeroBEV.load(workspace.runs / key / "model.safetensors"), "cpu")
+    run = Run(EXPERIMENTS["d"], workspace)
+    record = run.recorded()
+    predict = model_predictor(ZeroBEV.load(run.weights), "cpu")
     batches = list(semantic_batches(DepthPretraining(workspace).views("test"), workspace.scale.camera, 16))
     assert len(batches) == 2  # one for each process
     torch.set_num_threads(1)
     assert record.counts == evaluate(predict, batches, 2, len(LABELS))
     assert record.history["step"][-1] == TINY.train.steps
     written = (folder / "written").read_text().splitlines()
-    assert [of for of in written if not of.startswith("DepthNet")] == ["ZeroBEV 0", "RecordStore 0"]
+    assert [of for of in written if not of.startswith("DepthNet")] == ["ZeroBEV 0", "RunStore 0"]
     assert not list(folder.rglob(".*part*"))
 
 

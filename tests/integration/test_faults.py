@@ -25,7 +25,7 @@ from zerobev.data.shards import write_shard
 from zerobev.data.textures import TextureBank
 from zerobev.data.views import View, ViewSource
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.records import Record, RecordStore
+from zerobev.experiments.run_records import RunStore
 from zerobev.models import build as build_network
 from zerobev.rendering.poses import navigable_floor
 from zerobev.report.notebooks import only_run
@@ -35,6 +35,7 @@ from zerobev.scenes.scene import Scene
 from zerobev.training.losses import Losses
 from zerobev.training.train import train
 
+from support.records import run_record
 from support.scenes import box, build, furnished, room
 
 CAMERA, TEXTURE = CameraConfig(fpv_px=16, bev_px=10), TextureConfig(tiles=2)
@@ -59,8 +60,7 @@ def views(scene: Scene) -> list[View]:
 
 def _record(folder: Path, version: int, *_: object) -> None:
     counts = Counts(np.full((500, 8), version), np.full((500, 8), 9))
-    record = Record("c-0", "c", 0, {}, {}, {}, [f"scene{i}" for i in range(500)], counts, {})
-    RecordStore(folder).write(record, np.random.default_rng(version).random((9, 8, 40, 40)) < 0.5)
+    RunStore(folder).write(run_record("c-0", counts), np.random.default_rng(version).random((9, 8, 40, 40)) < 0.5)
 
 
 def _home(folder: Path, version: int, scene: Scene, _: list[View]) -> None:

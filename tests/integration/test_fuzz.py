@@ -27,11 +27,12 @@ from PIL import Image
 import zerobev
 from zerobev.common.errors import InputError
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.records import Record, RecordStore
+from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.inference.projector import MAX_IMAGES
 from zerobev.scenes.hm3dsem import FIRST_LINE, read_instances, read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 
+from support.records import run_record
 from support.scenes import box, build, room
 
 _SECONDS, _BYTES = 20, 3 << 30
@@ -296,14 +297,15 @@ def test_textures_that_no_reader_should_open(home: Path) -> None:
 # --- records -------------------------------------------------------------------------------------------------------
 
 
-def record() -> Record:
+def record() -> RunRecord:
     counts = Counts(np.arange(16).reshape(2, 8), np.full((2, 8), 20))
     config = {"train": {"steps": 3}, "bands": [0.0, 0.8]}
-    return Record("c-0", "c", 0, config, {"revision": "a"}, {"train_seconds": 1.5}, ["a", "b"], counts, {"loss": [0.5]})
+    parts = {"origin": {"revision": "a"}, "cost": {"train_seconds": 1.5}, "history": {"loss": [0.5]}}
+    return run_record("c-0", counts, config=config, **parts)
 
 
 def test_records(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
+    store = RunStore(tmp_path)
     store.write(record(), np.ones((2, 8, 5, 5), bool))
     path = store.path("c-0")
     whole = path.read_bytes()
@@ -363,7 +365,7 @@ def odd_array(rng: Random) -> np.ndarray:
 
 
 def test_maps(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
+    store = RunStore(tmp_path)
     store.write(record(), np.ones((2, 8, 5, 5), bool))
     path = tmp_path / "gallery/c-0.npz"
     whole = path.read_bytes()

@@ -18,7 +18,8 @@ import pytest
 import trimesh
 from dask.distributed import LocalCluster
 
-from zerobev.common.errors import InputError, run_command
+from zerobev import cli
+from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig, TextureConfig, scale
 from zerobev.data import generate as generation
 from zerobev.data.generate import generate, shard_path, verify
@@ -259,15 +260,14 @@ def homes(folders, tmp_path) -> Path:
     return tmp_path / "homes"
 
 
-def call(monkeypatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["generate", *map(str, arguments)])
-    run_command(generation.main)
+def call(*arguments: object) -> None:
+    cli.main(["generate", *map(str, arguments)])
 
 
 def test_killed_run_goes_on_and_redoes_nothing(homes, tmp_path, monkeypatch):
     unbroken, out, log = tmp_path / "unbroken", tmp_path / "out", tmp_path / "log"
     options = ["--scenes", str(homes), "--scale", "smoke", "--views", "25", "--out"]
-    call(monkeypatch, *options, unbroken)
+    call(*options, unbroken)
     again = [sys.executable, "-m", "zerobev.data.generate", *options, str(out), "--workers", "2"]
     killed = subprocess.Popen(again, cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
     while len(there := list(out.glob("train/[!.]*.h5"))) < 2:
@@ -290,9 +290,9 @@ def test_killed_run_goes_on_and_redoes_nothing(homes, tmp_path, monkeypatch):
 
 def test_a_dask_cluster_writes_the_same_bytes(homes, tmp_path, monkeypatch):
     options = ["--scenes", homes, "--scale", "smoke", "--views", 2, "--out"]
-    call(monkeypatch, *options, tmp_path / "here")
+    call(*options, tmp_path / "here")
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        call(monkeypatch, *options, tmp_path / "dask", "--dask", cluster.scheduler_address)
+        call(*options, tmp_path / "dask", "--dask", cluster.scheduler_address)
         tasks = cluster.scheduler.transition_counter
     assert tasks > 0  # it was the cluster that worked
     for part in ("train", "validation", "test"):
@@ -301,16 +301,16 @@ def test_a_dask_cluster_writes_the_same_bytes(homes, tmp_path, monkeypatch):
 
 def test_command_verifies_every_split(homes, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    call(monkeypatch, "--scenes", homes, "--out", out, "--scale", "smoke", "--views", 2)
-    call(monkeypatch, "--verify", "--out", out)
+    call("--scenes", homes, "--out", out, "--scale", "smoke", "--views", 2)
+    call("--verify", "--out", out)
     truncate(out / "train/00003-AAAAAAAAAAA.h5")
     (out / "test/00900-AAAAAAAAAAA.h5").unlink()
     with pytest.raises(SystemExit, match=r"(?s)train/00003.*expected SHA-256.*test/00900.*found nothing"):
-        call(monkeypatch, "--verify", "--out", out)
+        call("--verify", "--out", out)
     with pytest.raises(
         SystemExit, match=r"^error: .*train/manifest\.json: expected a manifest of shards, found nothing"
     ):
-        call(monkeypatch, "--verify", "--out", tmp_path / "nowhere")
+        call("--verify", "--out", tmp_path / "nowhere")
 
 
 def test_command_reports_a_broken_scene(homes, folders, tmp_path, monkeypatch):
@@ -319,7 +319,7 @@ def test_command_reports_a_broken_scene(homes, folders, tmp_path, monkeypatch):
     shutil.copytree(folders[0], broken)
     (broken / "AAAAAAAAAAA.semantic.txt").write_text("nonsense")
     with pytest.raises(SystemExit, match=r"^skipped 00001-AAAAAAAAAAA: .*semantic\.txt.*expected") as stopped:
-        call(monkeypatch, "--scenes", homes, "--out", tmp_path / "out", "--scale", "smoke", "--views", 2)
+        call("--scenes", homes, "--out", tmp_path / "out", "--scale", "smoke", "--views", 2)
     assert stopped.value.code not in (0, None)
     assert len(list(tmp_path.glob("out/*/[!.]*.h5"))) == 6
     assert sorted(json.loads((tmp_path / "out/train/manifest.json").read_text())["shards"]) == [
@@ -329,7 +329,7 @@ def test_command_reports_a_broken_scene(homes, folders, tmp_path, monkeypatch):
 
 def test_dask_address_that_is_none(homes, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"^error: --dask: expected the address of a scheduler, found 'nonsense'"):
-        call(monkeypatch, "--scenes", homes, "--out", tmp_path / "out", "--dask", "nonsense")
+        call("--scenes", homes, "--out", tmp_path / "out", "--dask", "nonsense")
 
 
 def test_command_records_every_split(folders, tmp_path, monkeypatch, capsys):
@@ -339,12 +339,10 @@ def test_command_records_every_split(folders, tmp_path, monkeypatch, capsys):
         (tmp_path / "homes" / split / folder.name).symlink_to(folder)
     homes, out = tmp_path / "homes", tmp_path / "out"
     command = ["generate", "--scale", "smoke", "--views", "2", "--out", str(out), "--scenes"]
-    monkeypatch.setattr(sys, "argv", [*command, str(homes)])
-    run_command(generation.main)
+    cli.main([*command, str(homes)])
     first, second = (folder.name for folder in folders)
     shards = {path.relative_to(out).as_posix(): path for path in out.rglob("*.h5")}
     assert sorted(shards) == [f"test/{second}.h5", f"train/{first}.h5", f"validation/{first}.h5"]
     assert {len(Shard(path, scale("smoke").camera, scale("smoke").texture)) for path in shards.values()} == {2}
-    monkeypatch.setattr(sys, "argv", [*command, str(tmp_path / "nowhere")])
     with pytest.raises(SystemExit, match=r"^error: .*nowhere: expected .*, found nothing$"):
-        run_command(generation.main)
+        cli.main([*command, str(tmp_path / "nowhere")])

@@ -1,21 +1,21 @@
 """The shipped weights on a folder of homes: against recorded shards of the same views, and as a command."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from zerobev.common.errors import InputError, run_command
+from zerobev import cli
+from zerobev.common.errors import InputError
 from zerobev.config import LABELS, TextureConfig
 from zerobev.data.generate import generate_shard
 from zerobev.data.samples import ViewSet, semantic_batches
 from zerobev.data.shards import Shard
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.evaluation.metrics import Counts
-from zerobev.evaluation.real_homes import METHODS, evaluate_homes, main
+from zerobev.evaluation.real_homes import METHODS, evaluate_homes
 from zerobev.geometry.projection import inverse_project
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 from zerobev.models import load_model
@@ -66,12 +66,7 @@ def test_every_row_is_another_method(counts):
     assert counts["a.1"].pixel_iou() > counts["a.2"].pixel_iou()
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["evaluate", *map(str, arguments)])
-    run_command(main)
-
-
-def test_the_command_takes_every_home_and_skips_broken_ones_loudly(homes, tmp_path, monkeypatch, capsys):
+def test_the_command_takes_every_home_and_skips_broken_ones_loudly(homes, tmp_path, capsys):
     for folder in (homes / "val/00001-HomeA", homes / "train/00002-HomeB"):
         target = tmp_path / "some" / folder.parent.name
         target.mkdir(parents=True)
@@ -81,7 +76,9 @@ def test_the_command_takes_every_home_and_skips_broken_ones_loudly(homes, tmp_pa
     for kind in ("glb", "semantic.glb", "semantic.txt"):
         (broken / f"HomeC.{kind}").write_text("nothing")
     with pytest.raises(SystemExit, match=r"skipped 00003-HomeC: .*expected"):
-        run(monkeypatch, "--scenes", tmp_path / "some", "--views", 1, "--json", tmp_path / "found.json")
+        cli.main(
+            ["evaluate", "--scenes", str(tmp_path / "some"), "--views", "1", "--json", str(tmp_path / "found.json")]
+        )
     assert "2 homes, 1 views each" in capsys.readouterr().out
     found = json.loads((tmp_path / "found.json").read_text())
     assert found["scenes"] == ["00001-HomeA", "00002-HomeB"] and set(found["rows"]) == set(METHODS)

@@ -14,8 +14,10 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-from zerobev.common.errors import InputError, run_command
-from zerobev.report.notebooks import NotebookError, kernel_settings, main, refresh, report_name, reproduce
+from zerobev import cli
+from zerobev.common.errors import InputError
+from zerobev.report import notebooks as workbook
+from zerobev.report.notebooks import NotebookError, kernel_settings, refresh, report_name, reproduce
 
 from support.paths import ROOT
 
@@ -83,10 +85,10 @@ def test_a_failing_notebook_ends_the_run_in_one_clear_line(folders, monkeypatch,
         folders["notebooks"] / "01_bad.ipynb", "1 + 1", "\nerror = 0.5\nassert error < 0.1, f'{error} m\\nor so'", "2"
     )
     write_notebook(folders["notebooks"] / "02_never.ipynb", "print('never')")
-    monkeypatch.setattr(sys, "argv", ["reproduce", "--scale", "smoke"])
+    monkeypatch.setattr(workbook, "reproduce", partial(reproduce, **folders))
 
     with pytest.raises(SystemExit) as stopped:
-        run_command(partial(main, **folders))
+        cli.main(["reproduce", "--scale", "smoke"])
 
     log = folders["reports"] / "smoke/logs/01_bad.log"
     message = "01_bad.ipynb, code cell 3 (`error = 0.5`): AssertionError: 0.5 m"

@@ -14,8 +14,8 @@ from zerobev.benchmarks.run import recorded_benchmark
 from zerobev.config import SCALES
 from zerobev.evaluation.metrics import Counts
 from zerobev.experiments.recorded import recorded_motion, recorded_unseen
-from zerobev.experiments.records import Record, RecordStore
 from zerobev.experiments.registry import EXPERIMENTS
+from zerobev.experiments.run_records import RunStore
 from zerobev.experiments.runs import recorded
 from zerobev.experiments.workspace import Workspace
 from zerobev.report.claims import compare, judge
@@ -25,6 +25,7 @@ from zerobev.report.paper import CLAIMS, RATIOS, TABLES
 from zerobev.report.tables import table
 
 from support.paths import ROOT, SHARED
+from support.records import run_record
 
 REPORTS = [ROOT / "reports" / scale for scale in SCALES if (ROOT / "reports" / scale / "records").is_dir()]
 PAPER = SHARED / "paper/zero-bev.tex"
@@ -36,7 +37,7 @@ PUBLISHED = "be36107f51292f5f2da4f5924f6a063a2d62f084141e0b4d0bc44922f9250994"
 @pytest.mark.parametrize("report", REPORTS, ids=lambda report: report.name)
 def test_records_are_as_they_were_written(report: Path):
     """What is not sealed yet is by `store.write(store.find(key), store.maps(key))`."""
-    store = RecordStore(report)
+    store = RunStore(report)
     keys = [path.stem for path in sorted((report / "records").glob("*.json"))]
     assert keys and [key for key in keys if not store.is_sealed(key)] == []
 
@@ -44,8 +45,8 @@ def test_records_are_as_they_were_written(report: Path):
 def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
     counts = Counts(np.arange(16).reshape(2, 8), np.full((2, 8), 20))
     config = {"train": {"steps": 3, "rate": 1e-3}, "bands": (0.0, 0.8)}
-    record = Record("c-0", "c", 0, config, {}, {"seconds": 1.5}, ["a", "b"], counts, {"loss": [0.5, 0.1]})
-    store, maps = RecordStore(tmp_path), np.ones((2, 8, 5, 5), bool)
+    record = run_record("c-0", counts, config=config, cost={"seconds": 1.5}, history={"loss": [0.5, 0.1]})
+    store, maps = RunStore(tmp_path), np.ones((2, 8, 5, 5), bool)
     store.write(record, maps)
     assert store.is_sealed("c-0") and store.find("c-0").sha256 == record.sha256
     text = store.path("c-0").read_text()

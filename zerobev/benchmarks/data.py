@@ -1,11 +1,10 @@
-"""How fast views and pairs are made: `python -m zerobev.benchmarks.data --scale S [--json FILE]`.
+"""Rates of views and of pairs.
 
-Pairs are made by look-up in stored views and, in the same run, by rendering each texture anew: the texture is
-put on the mesh, and the mesh is rendered from both cameras. Machines differ, and one machine from minute to
-minute: trust the ratios, and look at their spread.
+Pairs are made by look-up in stored views and, in the same run, by rendering each texture anew: the texture is put on
+the mesh, and the mesh is rendered from both cameras. Rates differ between machines and from minute to minute: the
+ratios, with their spread, carry over.
 """
 
-import argparse
 import itertools
 import tempfile
 import time
@@ -19,9 +18,7 @@ import joblib
 import numpy as np
 import torch
 
-from zerobev.common.errors import run_command
-from zerobev.common.storage import write_json
-from zerobev.config import SCALES, CameraConfig, Scale, scale
+from zerobev.config import CameraConfig, Scale
 from zerobev.data.samples import DepthProjSamples, ModSemSamples, SampleStream, SynthSamples, ViewSet
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank, modsem_textures, random_rectangles
@@ -213,21 +210,6 @@ def measure(setting: Scale, repeats: int, seconds: float) -> dict[str, Any]:
     return report(setting, views, pairs)
 
 
-def main() -> None:
-    """Measure, print the table, and write everything with `--json`."""
-    parser = argparse.ArgumentParser(prog="python -m zerobev.benchmarks.data", description=__doc__)
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--repeats", type=int, default=5, help="stretches of which the median is taken (default: 5)")
-    parser.add_argument("--seconds", type=float, default=2.0, help="length of a stretch of views (default: 2)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything measured to FILE")
-    options = parser.parse_args()
-    measured = measure(scale(options.scale), options.repeats, options.seconds)
-    for line in table(measured):
-        print(line)
-    if options.json:
-        write_json(options.json, measured)
-
-
 def _views(folder: Path, setting: Scale) -> tuple[Scene, ViewSource]:
     """A home and the source of its views, after the first of them."""
     scene = read_scene(folder)
@@ -241,7 +223,3 @@ def _seconds_each(items: Sequence[Any], make: Callable, *arguments: Any) -> floa
     for item in items:
         make(item, *arguments)
     return (time.perf_counter() - start) / len(items)
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -39,7 +39,7 @@ def _changed(config: Any, path: list[str], text: str, setting: str) -> Any:
         return replace(config, **{name: _changed(value, rest, text, setting)})
     try:
         return replace(config, **{name: _parsed(text, get_type_hints(type(config))[name])})
-    except (ValueError, TypeError, SyntaxError) as error:
+    except ValueError as error:  # of another type, or refused by the dataclass
         raise InputError(f"setting {setting!r}: {error}") from None
 
 
@@ -52,7 +52,8 @@ def _parsed(text: str, kind: Any) -> Any:
     if kind is float and type(value) is int:
         value = float(value)
     if not _is_of(value, kind):
-        raise ValueError(f"expected {getattr(kind, '__name__', kind)}, found {text!r}")
+        expected = kind.__name__ if isinstance(kind, type) else str(kind).removeprefix("typing.")
+        raise ValueError(f"expected {expected}, found {text!r}")
     return value
 
 

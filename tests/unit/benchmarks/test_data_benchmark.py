@@ -1,7 +1,6 @@
 """The benchmark compares what is the same: pairs that are rendered anew are those that are looked up."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy import ndimage
 
 from zerobev.benchmarks import data as benchmark
 from zerobev.benchmarks.data import noise_bank, texture_images
-from zerobev.common.errors import run_command
 from zerobev.config import CameraConfig, Scale, scale
 from zerobev.geometry.cameras import Pose
 from zerobev.rendering.gbuffer import RayCaster
@@ -69,8 +67,8 @@ def test_share_of_a_noise_bank(setting):
 
 
 @pytest.fixture
-def measured(scene, setting, tmp_path, monkeypatch, capsys) -> dict:
-    """What the command writes, on a hand-made home, in the shortest time."""
+def measured(scene, setting, monkeypatch) -> dict:
+    """The measurements of a hand-made home, in the shortest time, as JSON gives them back."""
 
     def folder(root, number):
         write_scene(root / f"{number:05d}-Home", scene)
@@ -79,11 +77,8 @@ def measured(scene, setting, tmp_path, monkeypatch, capsys) -> dict:
     monkeypatch.setattr(benchmark, "home_folder", folder)
     monkeypatch.setattr(benchmark, "WORKERS", (1,))
     monkeypatch.setattr(benchmark, "_STORED", 3)
-    monkeypatch.setattr(benchmark, "scale", lambda _: setting)
-    options = ["--repeats", "3", "--seconds", "0.1", "--json", str(tmp_path / "speed.json")]
-    monkeypatch.setattr(sys, "argv", ["benchmark", *options])
-    run_command(benchmark.main)
-    return json.loads((tmp_path / "speed.json").read_text()) | {"printed": capsys.readouterr().out}
+    found = benchmark.measure(setting, repeats=3, seconds=0.1)
+    return json.loads(json.dumps(found)) | {"printed": "\n".join(benchmark.table(found))}
 
 
 def test_figures_follow_from_what_was_measured(measured):

@@ -1,7 +1,6 @@
 """The plan of a reproduction: its arithmetic, what it measures, and the paper's scale once through in small numbers."""
 
 import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,13 +10,13 @@ import torch
 from torch import nn
 from transformers import ResNetConfig, ResNetModel
 
-from zerobev.benchmarks import forecast as planning
-from zerobev.benchmarks.forecast import Network, Plan, plan, saved_bytes
-from zerobev.common.errors import InputError, run_command
+from zerobev import cli
+from zerobev.benchmarks import forecast as forecasting
+from zerobev.benchmarks.forecast import Forecast, Network, forecast, saved_bytes
+from zerobev.common.errors import InputError
 from zerobev.config import SCALES, SceneConfig, TextureConfig
-from zerobev.experiments.records import RecordStore
 from zerobev.experiments.registry import EXPERIMENTS
-from zerobev.experiments.runs import run, run_key
+from zerobev.experiments.runs import Run
 from zerobev.experiments.workspace import Workspace
 from zerobev.models import build
 
@@ -29,7 +28,7 @@ TINY = replace(
     scenes=SceneConfig(train=1, validation=1, test=1, views=12),
     texture=TextureConfig(tiles=2, tile_px=128),
 )
-PLAN = Plan(
+FORECAST = Forecast(
     scale=replace(SCALES["paper"], test_views=500),
     homes={"train": 145, "validation": 4, "test": 32},
     networks=24,
@@ -43,17 +42,17 @@ PLAN = Plan(
 
 
 def test_arithmetic_of_a_plan_by_hand():
-    assert PLAN.views == 362_000
-    assert PLAN.disk_bytes == {
+    assert FORECAST.views == 362_000
+    assert FORECAST.disk_bytes == {
         "views": 217.2e9,
         "depth": 362_000 * 384 * 384 * 2,  # float16
         "weights": (24 * 2 + 4) * 200e6,
     }
-    assert PLAN.needed_bytes["free disk"] == pytest.approx(217.2e9 + 106.758144e9 + 10.4e9 - 100e9)
+    assert FORECAST.needed_bytes["free disk"] == pytest.approx(217.2e9 + 106.758144e9 + 10.4e9 - 100e9)
     # 32 photographs of the estimator take more than 16 samples of (c): 1 + 5 x 0.1 + 32 x 0.3 against 1 + 1 + 8 GB
-    assert PLAN.needed_bytes["memory"] == pytest.approx(11.1e9)
-    assert replace(PLAN, estimator=PLAN.network).needed_bytes["memory"] == pytest.approx(18e9)
-    assert PLAN.hours(workers=2) == pytest.approx(
+    assert FORECAST.needed_bytes["memory"] == pytest.approx(11.1e9)
+    assert replace(FORECAST, estimator=FORECAST.network).needed_bytes["memory"] == pytest.approx(18e9)
+    assert FORECAST.hours(workers=2) == pytest.approx(
         {
             "views": 81 * 2000 * 0.36 / 2 / 3600,
             "estimator": (612_500 * 32 * 0.1 + 362_000 * 0.05) / 3600,
@@ -61,17 +60,17 @@ def test_arithmetic_of_a_plan_by_hand():
             "evaluation": 20 * 4.0,  # 32 homes x 500 views x 0.9 s
         }
     )
-    assert replace(PLAN, there_bytes=10**12).needed_bytes["free disk"] == 0
+    assert replace(FORECAST, there_bytes=10**12).needed_bytes["free disk"] == 0
 
 
 def test_what_does_not_fit_is_refused_in_one_line():
     there = {"free disk": 235e9, "memory": 12e9}
-    PLAN.check(there)
+    FORECAST.check(there)
     with pytest.raises(InputError, match=r"^scale paper: expected 234\.4 GB of free disk, found 200\.0 GB$"):
-        PLAN.check({**there, "free disk": 200e9})
+        FORECAST.check({**there, "free disk": 200e9})
     with pytest.raises(InputError, match=r"^scale paper: expected 11\.1 GB of memory, found 8\.0 GB$"):
-        PLAN.check({**there, "memory": 8e9})
-    table = PLAN.table(there, workers=2)
+        FORECAST.check({**there, "memory": 8e9})
+    table = FORECAST.table(there, workers=2)
     assert len(table.splitlines()) == 10 and "362,000" in table and "234.4 GB of free disk, of 235.0 GB" in table
 
 
@@ -84,9 +83,9 @@ def test_what_a_network_keeps_by_hand():
 
 def test_a_plan_foretells_the_views_and_sees_what_is_done(tmp_path, monkeypatch):
     monkeypatch.setitem(SCALES, "tiny", TINY)
-    monkeypatch.setattr(planning, "_SECONDS", 0.1)
+    monkeypatch.setattr(forecasting, "_SECONDS", 0.1)
     workspace = Workspace("tiny", root=tmp_path)
-    before = plan(workspace)
+    before = forecast(workspace)
     assert not list(tmp_path.iterdir())  # it leaves nothing behind
     assert before.homes == {"train": 1, "validation": 1, "test": 1} and before.there_bytes == 0
     assert before.left == {"homes": 3, "networks": before.networks, "estimators": 1}
@@ -96,8 +95,8 @@ def test_a_plan_foretells_the_views_and_sees_what_is_done(tmp_path, monkeypatch)
     size = views.shards[0].path.stat().st_size
     assert 12 * before.view_bytes == pytest.approx(size, rel=0.3)
     measured = {name: getattr(before, name) for name in ("view_bytes", "view_s", "network", "estimator")}
-    monkeypatch.setattr(planning, "measure", lambda scale, home: measured)
-    after = plan(workspace)
+    monkeypatch.setattr(forecasting, "measure", lambda scale, home: measured)
+    after = forecast(workspace)
     assert after.left["homes"] == 2
     assert size <= after.there_bytes < 1.1 * size  # and the manifest
     weights = sum(p.numel() for p in build("c", TINY.camera, TINY.model).parameters())
@@ -105,31 +104,30 @@ def test_a_plan_foretells_the_views_and_sees_what_is_done(tmp_path, monkeypatch)
 
 
 def test_the_command_prints_the_plan_and_refuses(monkeypatch, capsys):
-    monkeypatch.setattr(planning, "plan", lambda workspace: PLAN)
-    monkeypatch.setattr(planning.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e9))
-    monkeypatch.setattr(sys, "argv", ["plan", "--scale", "paper"])
+    monkeypatch.setattr(forecasting, "forecast", lambda workspace: FORECAST)
+    monkeypatch.setattr(forecasting.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e9))
     with pytest.raises(SystemExit, match=r"^error: scale paper: expected 234\.4 GB of free disk, found 1\.0 GB$"):
-        run_command(planning.main)
+        cli.main(["plan", "--scale", "paper"])
     assert "362,000" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     "arguments, called",
     [
-        (["SCALE=paper"], ["plan", "reproduce", "summary", "spot_check"]),
+        (["SCALE=paper"], ["plan", "reproduce", "summary", "spot-check"]),
         (["SCALE=paper", "PLAN=1"], ["plan"]),
         (["SCALE=smoke", "PLAN=1"], ["plan"]),
-        (["SCALE=smoke", "PLAN=0"], ["reproduce", "summary", "spot_check"]),
+        (["SCALE=smoke", "PLAN=0"], ["reproduce", "summary", "spot-check"]),
         (["SCALE=paper", "REFUSED=1"], ["plan"]),
     ],
 )
 def test_make_plans_the_papers_scale_first(arguments, called, tmp_path):
     python = tmp_path / "python"
-    python.write_text('#!/bin/sh\necho "$2"\n[ -z "$REFUSED" ] || exit 1\n')
+    python.write_text('#!/bin/sh\necho "$2 $3"\n[ -z "$REFUSED" ] || exit 1\n')
     python.chmod(0o755)
     command = ["make", "-C", str(ROOT), "-o", "setup", "reproduce", f"PYTHON={python}", *arguments]
     ended = subprocess.run(command, capture_output=True, text=True)
-    assert [line for line in ended.stdout.splitlines() if "." in line] == [f"zerobev.{module}" for module in called]
+    assert [line for line in ended.stdout.splitlines() if "zerobev" in line] == [f"zerobev {name}" for name in called]
     assert (ended.returncode == 0) == ("REFUSED=1" not in arguments)
 
 
@@ -147,14 +145,13 @@ def test_the_papers_scale_once_through(tmp_path, monkeypatch):
     )
     monkeypatch.setitem(SCALES, "paper", few)
     workspace = Workspace("paper", root=tmp_path)
-    record = run(EXPERIMENTS["c"], workspace)
-    store = RecordStore(workspace.reports)
-    found = store.find(run_key(EXPERIMENTS["c"], workspace, 0))
+    run = Run(EXPERIMENTS["c"], workspace)
+    record, found = run.record(), run.recorded()
     assert found.counts == record.counts and found.history == record.history
     assert record.history["step"] == list(range(1, 11))
     assert np.isfinite(record.history["loss"]).all()
     assert [score is not None for score in record.history["validation"]] == [False] * 9 + [True]
-    assert store.maps(record.key).shape == (2, 8, 100, 100)
+    assert run.store.maps(record.key).shape == (2, 8, 100, 100)
     assert workspace.views("train").shards[0].view(0).rgb.shape == (384, 384, 3)
     assert not (workspace.reports / "depth.json").exists()  # at this scale (c) needs no estimator
     assert record.counts.union.shape == (1, 8) and record.counts.union.sum() > 0

@@ -4,7 +4,7 @@ import json
 import os
 import re
 import subprocess
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,39 +15,40 @@ from hypothesis.extra import numpy as arrays
 
 from zerobev.common.errors import InputError
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.records import Record, RecordStore, cached, git_revision, origin
+from zerobev.experiments.provenance import git_revision, origin
+from zerobev.experiments.records import recorded
+from zerobev.experiments.run_records import RunRecord, RunStore
+
+from support.records import run_record
 
 MAPS = np.random.default_rng(0).random((2, 8, 5, 5)) < 0.5
 
 
-def record(key: str = "c-seed0-abc", counts: Counts | None = None) -> Record:
-    return Record(
-        key=key,
-        row="c",
-        seed=0,
+def record(key: str = "c-seed0-abc", counts: Counts | None = None) -> RunRecord:
+    return run_record(
+        key,
+        counts or Counts(np.array([[1, 0], [2, 3]]), np.array([[4, 0], [2, 2**40]])),
         config={"train": {"steps": 3, "rate": 1e-3}, "bands": [0.0, 0.8]},
         origin={"revision": "0123456789ab", "versions": {"torch": "2"}},
         cost={"train_seconds": 1.5},
-        scenes=["a", "b"],
-        counts=counts or Counts(np.array([[1, 0], [2, 3]]), np.array([[4, 0], [2, 2**40]])),
         history={"loss": [0.5, 0.25], "validation": [None, 0.1]},
     )
 
 
 def test_record_comes_back_as_it_was(tmp_path):
-    store = RecordStore(tmp_path)
+    store = RunStore(tmp_path)
     assert store.find("c-seed0-abc") is None
     store.write(record(), MAPS)
     assert store.find("c-seed0-abc") == record()
     assert store.path("a.1-seed0-x").name == "a.1-seed0-x.json"
     files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file())
     assert files == ["gallery/c-seed0-abc.npz", "records/c-seed0-abc.json"]
-    assert len(store.path(record().key).read_text().splitlines()) == 2 + len(vars(record()))  # a line an entry
+    assert len(store.path(record().key).read_text().splitlines()) == 2 + len(fields(RunRecord))  # a line per entry
 
 
 def test_same_record_same_bytes(tmp_path):
     for name in "ab":
-        RecordStore(tmp_path / name).write(record(), MAPS)
+        RunStore(tmp_path / name).write(record(), MAPS)
     first, again = ([p.read_bytes() for p in sorted((tmp_path / n).rglob("*.*"))] for n in "ab")
     assert first == again
 
@@ -55,14 +56,14 @@ def test_same_record_same_bytes(tmp_path):
 @given(arrays.arrays(bool, st.tuples(*(st.integers(1, n) for n in (3, 3, 19, 19)))))
 @settings(max_examples=25)
 def test_maps_of_any_size_come_back(tmp_path_factory, maps):
-    store = RecordStore(tmp_path_factory.mktemp("maps"))
+    store = RunStore(tmp_path_factory.mktemp("maps"))
     store.write(record(), maps)
     found = store.maps(record().key)
     assert found.dtype == bool and np.array_equal(found, maps)
 
 
 def test_records_of_before_a_call_for_fresh_ones_are_not_found(tmp_path, monkeypatch):
-    store = RecordStore(tmp_path)
+    store = RunStore(tmp_path)
     store.write(record(), MAPS)
     os.utime(store.path(record().key), (1000, 1000))
     for moment, found in (("999", True), ("1000", True), ("1001", False), ("0", True)):
@@ -81,22 +82,23 @@ def test_records_of_before_a_call_for_fresh_ones_are_not_found(tmp_path, monkeyp
         lambda text: "[1, 2]",
         lambda text: "3",
         lambda text: text.replace('"row"', '"line"'),
+        lambda text: text.replace('"seed": 0', '"seed": "0"'),
         lambda text: text.replace('"intersection"', '"overlap"'),
         lambda text: text.replace("[[1, 0]", "[[5, 0]"),  # more than the union
     ],
 )
 def test_a_file_that_is_no_record(tmp_path, damage):
-    store = RecordStore(tmp_path)
+    store = RunStore(tmp_path)
     store.write(record(), MAPS)
     path = store.path(record().key)
     path.write_text(damage(path.read_text()))
-    with pytest.raises(InputError, match=r"c-seed0-abc\.json: expected a record of a run, found .") as caught:
+    with pytest.raises(InputError, match=r"c-seed0-abc\.json: expected a record, found .") as caught:
         store.find(record().key)
     assert "\n" not in str(caught.value)
 
 
 def test_a_file_without_maps(tmp_path):
-    store = RecordStore(tmp_path)
+    store = RunStore(tmp_path)
     with pytest.raises(InputError, match=r"c-seed0-abc\.npz: expected the maps of a run, found ."):
         store.maps(record().key)
     store.write(record(), MAPS)
@@ -115,7 +117,7 @@ def test_a_file_without_maps(tmp_path):
 
 
 def test_an_interrupted_write_leaves_no_record(tmp_path):
-    store = RecordStore(tmp_path)
+    store = RunStore(tmp_path)
     with pytest.raises(TypeError):
         store.write(replace(record(), config={"model": object()}), MAPS)  # not JSON
     assert store.find(record().key) is None
@@ -129,7 +131,7 @@ def test_origin_says_where_a_number_comes_from():
     assert found["revision"] and str(Path.home()) not in json.dumps(found)
 
 
-def test_what_is_kept_is_computed_once_for_each_identity(tmp_path):
+def test_a_result_is_computed_once_for_each_configuration(tmp_path):
     path, made = tmp_path / "a.json", []
 
     def compute() -> dict[str, object]:
@@ -137,13 +139,47 @@ def test_what_is_kept_is_computed_once_for_each_identity(tmp_path):
         return {"value": made[-1], "spread": (0.5, 1.5)}
 
     # as JSON has it, in its order: a table made of it looks the same the first time and later
-    first, second = ([*cached(path, {"weights": "x"}, compute).items()] for _ in range(2))
+    first, second = ([*recorded(path, "a", {"weights": "x"}, compute).items()] for _ in range(2))
     assert first == second == [("spread", [0.5, 1.5]), ("value", 0)]
-    assert cached(path, {"weights": "y"}, compute)["value"] == 1
-    assert made == [0, 1] and {"origin", "seconds"} <= set(json.loads(path.read_text()))
+    assert recorded(path, "a", {"weights": "y"}, compute)["value"] == 1
+    assert made == [0, 1] and {"key", "config", "origin", "cost"} <= set(json.loads(path.read_text()))
     path.write_text("{}")
     with pytest.raises(InputError, match=r"a\.json: expected a record, found KeyError"):
-        cached(path, {"weights": "y"}, compute)
+        recorded(path, "a", {"weights": "y"}, compute)
+
+
+@dataclass(frozen=True)
+class Then:
+    steps: int
+    rate: float = 0.5
+
+
+@dataclass(frozen=True)
+class Grown(Then):
+    warmup: int = 0  # a field that is newer than the record
+
+
+@dataclass(frozen=True)
+class OtherDefault:
+    steps: int
+    rate: float = 0.25
+
+
+def test_a_record_survives_a_new_field_but_not_a_new_default(tmp_path):
+    path, made = tmp_path / "a.json", []
+
+    def compute() -> dict[str, object]:
+        made.append(0)
+        return {}
+
+    recorded(path, "a", {"train": Then(3)}, compute)
+    recorded(path, "a", {"train": Grown(3)}, compute)
+    assert len(made) == 1
+    recorded(path, "a", {"train": Grown(3, warmup=1)}, compute)
+    assert len(made) == 2
+    recorded(path, "a", {"train": Then(3)}, compute)
+    recorded(path, "a", {"train": OtherDefault(3)}, compute)  # the key is the same, the stored value is not
+    assert len(made) == 4
 
 
 def test_a_revision_is_dirty_where_the_code_was_changed(tmp_path):

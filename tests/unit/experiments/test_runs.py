@@ -1,6 +1,7 @@
 """Runs and their records, end to end on a scale of its own: two training homes, four steps."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -8,14 +9,14 @@ import pytest
 import torch
 
 from zerobev.common.errors import InputError
+from zerobev.common.keys import plain
 from zerobev.config import SCALES, SceneConfig, TextureConfig, TrainConfig
 from zerobev.data.samples import semantic_batches
 from zerobev.experiments import runs
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.gallery import gallery
-from zerobev.experiments.records import RecordStore
 from zerobev.experiments.registry import EXPERIMENTS, experiment
-from zerobev.experiments.runs import InTurn, recorded, records_of, run, run_key, stream, train_run
+from zerobev.experiments.runs import InTurn, Run, recorded, records_of
 from zerobev.experiments.spot_check import spot_check
 from zerobev.experiments.workspace import Workspace
 from zerobev.geometry.projection import inverse_project
@@ -43,7 +44,7 @@ def root(tmp_path_factory):
         patch.setitem(SCALES, "tiny", TINY)
         workspace = Workspace("tiny", root=root)
         for recorded in (PROJECTION, ESTIMATED, ZERO_BEV, RESIDUAL):
-            run(recorded, workspace)
+            Run(recorded, workspace).record()
     return root
 
 
@@ -54,12 +55,13 @@ def workspace(root, monkeypatch):
 
 
 def test_a_record_is_read_and_not_computed_again_until_a_fresh_one_is_asked_for(workspace, monkeypatch):
-    path = RecordStore(workspace.reports).path(run_key(PROJECTION, workspace, 0))
+    run = Run(PROJECTION, workspace)
+    path = run.store.path(run.key)
     before = path.stat().st_mtime_ns
-    first = run(PROJECTION, workspace)
+    first = run.record()
     assert path.stat().st_mtime_ns == before
     monkeypatch.setenv("ZEROBEV_FRESH", str(before / 1e9 + 0.001))
-    again = run(PROJECTION, workspace)
+    again = run.record()
     assert path.stat().st_mtime_ns != before
     assert again.counts == first.counts
 
@@ -74,7 +76,7 @@ def test_every_row_of_every_table_is_a_run_and_each_run_is_one_row():
     assert {e.network for e in trained} == set(VARIANTS)
     # only networks that are not zero-shot ever see the classes, and only the oracle is tested with true depth
     assert {e.row for e in trained if e.stream == "classes"} == {"b.1", "b.2", "b.3"}
-    assert [e.row for e in EXPERIMENTS.values() if e.test_depth == "gt"] == ["a.1"]
+    assert [e.row for e in EXPERIMENTS.values() if e.test_depth == "true"] == ["a.1"]
     with pytest.raises(InputError, match=r"row: expected one of a\.1, .*, found 'z'"):
         experiment("z")
 
@@ -93,7 +95,7 @@ def test_projections_are_what_their_depth_says(workspace, row, predicted):
         scene = int(batch["scene"])
         intersection[scene] += (found & truth & inside).sum(axis=(1, 2))
         union[scene] += ((found | truth) & inside).sum(axis=(1, 2))
-    counts = run(experiment(row), workspace).counts
+    counts = Run(experiment(row), workspace).record().counts
     # the batch that a photograph passes in may change the last digit of its depth
     assert abs(counts.intersection - intersection).max() <= (2 if predicted else 0)
     assert abs(counts.union - union).max() <= (2 if predicted else 0)
@@ -107,9 +109,10 @@ def test_each_row_is_trained_on_the_auxiliary_maps_that_it_names(workspace, monk
         runs, "train", lambda model, *arguments, objective, **named: objectives.update(pair=(model, objective))
     )
     for row, channels in {"c": [0, 1], "c.I": [0], "c.II": [1]}.items():
-        train_run(EXPERIMENTS[row], workspace, 0, f"aux-{row}")
+        run = Run(EXPERIMENTS[row], workspace)
+        run.train()
         model, objective = objectives["pair"]
-        batch = stream(EXPERIMENTS[row], workspace, "train", "gt", 0).batch(0)
+        batch = run.source("train", "true", 0).batch(0)
         with torch.no_grad():
             logits = model(batch["rgb"], batch["zero"]).aux_logits
             expected = dice_loss(logits.sigmoid(), batch["aux"][:, channels], batch["fov"])
@@ -117,7 +120,7 @@ def test_each_row_is_trained_on_the_auxiliary_maps_that_it_names(workspace, monk
 
 
 def test_the_papers_choices_are_one_row_away_from_ours(workspace):
-    ours, paper = (runs._config(EXPERIMENTS[row], workspace) for row in ("c", "c.paper"))
+    ours, paper = (Run(EXPERIMENTS[row], workspace).config for row in ("c", "c.paper"))
     reduced = SCALES["reduced"]
     assert EXPERIMENTS["c.paper"].texture(reduced).scales == (1.0, 1.0) != EXPERIMENTS["c"].texture(reduced).scales
     blank = {row: EXPERIMENTS[row].empty_fraction(reduced) for row in ("c", "c.paper", "b.2")}
@@ -132,7 +135,7 @@ def test_the_papers_choices_are_one_row_away_from_ours(workspace):
 
 
 def test_stages_of_depth_follow_each_other(workspace):
-    truth, predicted = (stream(RESIDUAL, workspace, "train", depth, 0) for depth in ("gt", "predicted"))
+    truth, predicted = (Run(RESIDUAL, workspace).source("train", depth, 0) for depth in ("true", "estimated"))
     assert not torch.equal(truth.batch(0)["depth"], predicted.batch(0)["depth"])
     assert torch.equal(truth.batch(0)["zero"], predicted.batch(0)["zero"])
     both = InTurn([truth, predicted], steps=5)
@@ -146,7 +149,7 @@ def test_every_network_starts_from_the_depth_estimators_backbone(workspace, monk
     started = {}
     monkeypatch.setattr(runs, "train", lambda model, *arguments, **named: started.update(model=model))
     for row in VARIANTS:
-        train_run(EXPERIMENTS[row], workspace, 0, f"start-{row}")
+        Run(EXPERIMENTS[row], workspace).train()
         first = started["model"].backbone.state_dict()
         same = [torch.equal(weights[name], first[name]) for name in first if not name.endswith("num_batches_tracked")]
         assert len(same) > 20 and all(same), row
@@ -155,27 +158,27 @@ def test_every_network_starts_from_the_depth_estimators_backbone(workspace, monk
 def test_the_depth_estimator_is_recorded_and_read(workspace, monkeypatch):
     monkeypatch.setattr(DepthPretraining, "_compute", lambda self: pytest.fail("trained again"))
     record = DepthPretraining(workspace).record
-    assert set(record["errors"]) == {"mad_m", "relative"} and record["errors"]["mad_m"] > 0
-    assert record["history"]["step"][-1] == 4
+    assert set(record.result["errors"]) == {"mad_m", "relative"} and record.result["errors"]["mad_m"] > 0
+    assert record.result["history"]["step"][-1] == 4
     monkeypatch.setitem(SCALES, "tiny", replace(TINY, depth=replace(TINY.depth, steps=5)))
     changed = DepthPretraining(Workspace("tiny", root=workspace.reports.parents[1]))
-    assert changed.key != record["key"]
+    assert changed.key != record.key
 
 
 def test_records_of_rows_are_those_of_every_recorded_seed(workspace):
-    store = RecordStore(workspace.reports)
     assert [(r.row, r.seed) for r in recorded(["c", "a.1", "e", "c"], workspace)] == [("c", 0), ("a.1", 0)]
-    second = replace(run(PROJECTION, workspace), key=run_key(PROJECTION, workspace, 1), seed=1)
-    store.write(second, np.zeros((1, 8, 20, 20), bool))
+    second = Run(PROJECTION, workspace, seed=1)
+    changed = replace(Run(PROJECTION, workspace).record(), key=second.key, config=plain(second.config))
+    second.store.write(changed, np.zeros((1, 8, 20, 20), bool))
     try:
         found = records_of(["a.1", "a.2"], workspace)
         assert [(r.row, r.seed) for r in found] == [("a.1", 0), ("a.1", 1), ("a.2", 0)]
     finally:
-        store.path(second.key).unlink()
+        second.store.path(second.key).unlink()
 
 
 def test_the_record_says_where_it_comes_from(workspace):
-    record = run(ZERO_BEV, workspace)
+    record = Run(ZERO_BEV, workspace).record()
     assert record.config["train"]["steps"] == 4 and record.config["data"]["scenes"]["views"] == 3
     assert record.origin["device"] == "cpu" and "torch" in record.origin["versions"]
     assert record.cost["train_seconds"] > 0 and record.cost["peak_memory_mb"] > 100
@@ -184,24 +187,24 @@ def test_the_record_says_where_it_comes_from(workspace):
 
 
 def test_the_key_follows_what_a_run_depends_on_and_nothing_else(workspace, monkeypatch):
-    projection, learned = (run_key(e, workspace, 0) for e in (PROJECTION, ZERO_BEV))
-    assert run_key(ZERO_BEV, workspace, 1) != learned
+    projection, learned = (Run(e, workspace).key for e in (PROJECTION, ZERO_BEV))
+    assert Run(ZERO_BEV, workspace, seed=1).key != learned
     monkeypatch.setitem(SCALES, "tiny", replace(TINY, train=replace(TINY.train, steps=5)))
     changed = Workspace("tiny", root=workspace.reports.parents[1])
-    assert run_key(ZERO_BEV, changed, 0) != learned
-    assert run_key(PROJECTION, changed, 0) == projection
+    assert Run(ZERO_BEV, changed).key != learned
+    assert Run(PROJECTION, changed).key == projection
     monkeypatch.setitem(SCALES, "tiny", replace(TINY, camera=replace(TINY.camera, hfov_deg=80.0)))
     changed = Workspace("tiny", root=workspace.reports.parents[1])
-    assert run_key(PROJECTION, changed, 0) != projection
+    assert Run(PROJECTION, changed).key != projection
 
 
 def test_the_gallery_holds_what_the_kept_weights_predict(workspace):
-    record = run(ZERO_BEV, workspace)
+    record = Run(ZERO_BEV, workspace).record()
     views = gallery(workspace)
-    maps = RecordStore(workspace.reports).maps(record.key)
+    maps = Run(ZERO_BEV, workspace).store.maps(record.key)
     assert maps.shape == (6, 8, 20, 20) and views["bev_label"].shape == (6, 20, 20)
     assert not (maps & ~views["fov"][:, None]).any()
-    model = ZeroBEV.load(workspace.runs / record.key / "model.safetensors")
+    model = ZeroBEV.load(Run(ZERO_BEV, workspace).weights)
     batch = next(iter(semantic_batches(workspace.views("test"), workspace.scale.camera, batch=6)))
     logits = model(batch["rgb"], batch["zero"]).zero_logits
     assert ((logits > 0).numpy() & views["fov"][:, None] == maps).mean() > 0.999
@@ -211,7 +214,8 @@ def test_training_never_opens_a_test_scene(workspace, monkeypatch, tmp_path):
     asked = []
     views = Workspace.views
     monkeypatch.setattr(Workspace, "views", lambda self, part, scenes=None: asked.append(part) or views(self, part))
-    train_run(RESIDUAL, workspace, 0, "train-only")
+    shutil.rmtree(Run(RESIDUAL, workspace).folder)
+    Run(RESIDUAL, workspace).train()
     assert set(asked) == {"train", "validation"}
     split = workspace.split
     assert not {*split.train, *split.validation} & {*split.test}
@@ -219,10 +223,11 @@ def test_training_never_opens_a_test_scene(workspace, monkeypatch, tmp_path):
 
 def test_spot_check_agrees_with_an_honest_record_and_not_with_a_changed_one(workspace):
     assert spot_check(workspace, "a.1").agrees
-    path = RecordStore(workspace.reports).path(run_key(PROJECTION, workspace, 0))
+    path = Run(PROJECTION, workspace).store.path(Run(PROJECTION, workspace).key)
     honest = path.read_text()
     record = json.loads(honest)
-    record["counts"]["intersection"] = [[cells // 2 for cells in scene] for scene in record["counts"]["intersection"]]
+    counts = record["result"]["counts"]
+    counts["intersection"] = [[cells // 2 for cells in scene] for scene in counts["intersection"]]
     path.write_text(json.dumps(record))
     try:
         changed = spot_check(workspace, "a.1")

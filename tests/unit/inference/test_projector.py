@@ -12,14 +12,15 @@ from PIL import Image
 from safetensors import safe_open
 
 import zerobev
-from zerobev.common.errors import InputError, run_command
+from zerobev import cli
+from zerobev.common.errors import InputError
 from zerobev.config import SCALES, CameraConfig
 from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.experiments.release import SCALE, halve, runs
+from zerobev.experiments.release import SCALE, halve, released_runs
 from zerobev.experiments.workspace import Workspace
 from zerobev.geometry.projection import inverse_project
 from zerobev.inference.images import LEVELS
-from zerobev.inference.project import main, read_image, read_labels, read_mask
+from zerobev.inference.project import read_image, read_labels, read_mask
 from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS, run_of, shipped
 from zerobev.models import build, load_model
 from zerobev.models.depth import DepthNet
@@ -75,7 +76,7 @@ def test_the_package_is_light_until_it_is_used():
 def test_the_weights_are_small_and_come_from_the_recorded_runs():
     files = {path.stem: path for path in FOLDER.glob("*")}
     assert set(files) == {*ROWS, DEPTH} and sum(path.stat().st_size for path in files.values()) < 12e6
-    assert {name: run_of(path) for name, path in files.items()} == runs()
+    assert {name: run_of(path) for name, path in files.items()} == released_runs()
     for row in ROWS:
         assert (ROOT / "reports" / SCALE / "records" / f"{run_of(files[row])}.json").exists()
     assert json.loads((ROOT / "reports" / SCALE / "depth.json").read_text())["key"] == run_of(files[DEPTH])
@@ -226,9 +227,8 @@ def test_masks_of_another_size_and_no_boxes_are_refused(rgb):
 # --- the command --------------------------------------------------------------------------------------------------
 
 
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
-    monkeypatch.setattr(sys, "argv", ["project", *map(str, arguments)])
-    run_command(main)
+def command(*arguments: object) -> None:
+    cli.main(["project", *map(str, arguments)])
 
 
 def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, monkeypatch, capsys):
@@ -236,7 +236,7 @@ def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, m
     Image.fromarray(rgb).save(photo)
     for path, mask in ((floor, masks[0]), (thing, masks[1])):
         Image.fromarray(mask.astype(np.uint8)).save(path)
-    command(monkeypatch, photo, "--masks", floor, thing, "--hfov", 85, "--out", out, "--row", ROWS[0])
+    command(photo, "--masks", floor, thing, "--hfov", 85, "--out", out, "--row", ROWS[0])
     expected = models[ROWS[0]].project(rgb, masks[:2], hfov_deg=85)
     with np.load(out.with_suffix(".npz")) as file:
         np.testing.assert_allclose(file["values"], expected.values, atol=1e-4)
@@ -246,7 +246,7 @@ def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, m
     assert "floor" in capsys.readouterr().out
 
     (tmp_path / "boxes.csv").write_text("xmin,ymin,xmax,ymax,label,score\n20,28,40,46,thing,0.8\n")
-    command(monkeypatch, photo, "--boxes", tmp_path / "boxes.csv", "--out", out, "--row", "a.2")
+    command(photo, "--boxes", tmp_path / "boxes.csv", "--out", out, "--row", "a.2")
     assert "0.8" in capsys.readouterr().out
 
 
@@ -261,7 +261,7 @@ def test_the_command_says_what_is_wrong(rgb, tmp_path, monkeypatch):
         ((tmp_path / "none.png", "--masks", photo, "--out", tmp_path / "a.png"), "none.png: expected an image"),
     ):
         with pytest.raises(SystemExit, match=message):
-            command(monkeypatch, *arguments)
+            command(*arguments)
     assert not (tmp_path / "a.png").exists()
 
 

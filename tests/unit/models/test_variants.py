@@ -1,7 +1,6 @@
 """Every network of the paper's tables: size, contract, sharing, checkpoints, and that it can learn."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from zerobev import cli
 from zerobev.common.errors import InputError
 from zerobev.config import AUX, LABELS, SCALES, CameraConfig
 from zerobev.geometry.projection import inverse_project, map_points
@@ -21,7 +21,7 @@ from zerobev.models.fpv_to_bev import reweigh
 from zerobev.models.max_pooling import noisy_or
 from zerobev.models.polar import band_rows
 from zerobev.report.paper import PARAMETERS_M
-from zerobev.report.parameters import main, parameters
+from zerobev.report.parameters import parameters
 from zerobev.training.losses import dice_loss, zero_bev_loss
 
 SMOKE = SCALES["smoke"]
@@ -118,17 +118,15 @@ def test_parameters_at_paper_scale_are_the_papers(row):
         assert table["backbone"] == pytest.approx(23.5e6, rel=0.002)
 
 
-def test_command_prints_every_block_and_writes_every_total(tmp_path, monkeypatch, capsys):
+def test_command_prints_every_block_and_writes_every_total(tmp_path, capsys):
     file = tmp_path / "table.json"
-    monkeypatch.setattr(sys, "argv", ["models", "--scale", "smoke", "--json", str(file)])
-    main()
+    cli.main(["parameters", "--scale", "smoke", "--json", str(file)])
     written, printed = json.loads(file.read_text()), capsys.readouterr().out
     assert written == {row: sum(p.numel() for p in network(row).parameters()) for row in ROWS}
     for count in parameters(network("d")).values():
         assert f"{count:,}" in printed
-    monkeypatch.setattr(sys, "argv", ["models", "--scale", "huge"])
-    with pytest.raises(InputError, match="scale: expected"):
-        main()
+    with pytest.raises(SystemExit, match="error: scale: expected"):
+        cli.main(["parameters", "--scale", "huge"])
 
 
 @pytest.mark.slow
