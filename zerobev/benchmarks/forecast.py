@@ -23,7 +23,7 @@ from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
 from zerobev.common.errors import InputError
 from zerobev.config import SCALES, SPLITS, Scale
 from zerobev.data.generate import shard_path
-from zerobev.data.samples import SynthSamples, ViewSet, collate, semantic_sample
+from zerobev.data.samples import SynthSamples, ViewSet, as_float, collate, semantic_sample
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.views import ViewSource
 from zerobev.experiments.depth_pretraining import DepthPretraining
@@ -35,7 +35,7 @@ from zerobev.models import build
 from zerobev.models.depth import DepthNet
 from zerobev.scenes.hm3dsem import read_scene
 from zerobev.training.depth import DepthSamples, depth_objective
-from zerobev.training.loader import Source, gpu_workers, model_inputs
+from zerobev.training.loader import Source, gpu_workers, model_inputs, moved
 from zerobev.training.train import Objective, dice_objective, training_accelerator
 
 _VIEWS, _SECONDS = 4, 4.0  # views that are stored and trained on; seconds in which they are counted
@@ -167,7 +167,7 @@ def measure(scale: Scale, home: Path | None) -> dict[str, Any]:
         synth = SynthSamples(
             views, bank, scale.camera, 0, samples, scale.empty_fraction, extruded_fraction=scale.extruded_fraction
         )
-        depth, test = DepthSamples(views, 0, samples), collate([semantic_sample(views, 0, scale.camera)])
+        depth, test = DepthSamples(views, 0, samples), as_float(collate([semantic_sample(views, 0, scale.camera)]))
         network, estimator = build("c", scale.camera, scale.model), DepthNet(scale.camera, scale.model)
         return {
             "view_bytes": path.stat().st_size / _VIEWS,
@@ -180,7 +180,7 @@ def measure(scale: Scale, home: Path | None) -> dict[str, Any]:
 def _network(net: nn.Module, objective: Objective, data: Source, samples: int, test: list[Tensor]) -> Network:
     accelerator, weights = training_accelerator(), sum(p.numel() * p.element_size() for p in net.parameters())
     device, net = accelerator.device, accelerator.prepare(net)
-    batch = {name: value.to(device) for name, value in data.batch(0, 0, 1).items()}
+    batch = moved(data.batch(0, 0, 1), device)
     drawn_s = _seconds(lambda: data.batch(1, 0, 1)) / samples
     process = 2**20 * peak_memory_mb() if device.type == "cpu" else 0
     kept = saved_bytes(lambda: objective(net, batch).total, net)

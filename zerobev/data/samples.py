@@ -1,12 +1,13 @@
-"""Views -> tuples (I_rgb, I_zero, M_zero, M_aux): the streams that networks are trained and tested on.
+"""Views -> samples (I_rgb, I_zero, M_zero, M_aux): the streams that networks are trained and tested on.
 
-Batches are dicts of tensors, float32 but for `scene` (B samples, K modalities, H pixels and M cells a side):
-`rgb` (B, 3, H, H) in [0, 1]; `zero` (B, K, H, H) and `target` (B, K, M, M) in {0, 1}; `aux` (B, 2, M, M)
-obstacles and navigable space; `fov` (B, 1, M, M) mask; `depth` (B, 1, H, H) metres; and `scene` (B,) int64.
+Batches are dicts of tensors (B samples, K modalities, H pixels and M cells per side): `rgb` (B, 3, H, H) uint8; `zero`
+(B, K, H, H) and `target` (B, K, M, M) bool; `aux` (B, 2, M, M) bool, obstacles and navigable space; `fov` (B, 1, M, M)
+bool; `depth` (B, 1, H, H) float32, metres; `scene` (B,) int64. They travel to worker processes and GPUs with a byte
+per value; networks take them as `as_float` returns them.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -239,9 +240,10 @@ class SemanticPass:
 
 
 def semantic_batches(views: ViewSet, camera: CameraConfig, batch: int) -> Iterator[dict[str, torch.Tensor]]:
-    """The batches of a `SemanticPass`, in order."""
+    """The batches of a `SemanticPass`, in order, as `as_float` returns them."""
     source = SemanticPass(views, camera, batch)
-    yield from map(source.batch, range(len(source)))
+    for number in range(len(source)):
+        yield as_float(source.batch(number))
 
 
 def semantic_sample(views: ViewSet, index: int, camera: CameraConfig) -> Sample:
@@ -261,12 +263,12 @@ def view_sample(view: View, camera: CameraConfig, scene: int, zero: np.ndarray, 
     surface = view.bev_texel[..., 0] >= 0
     obstacle = surface & (view.bev_height > camera.obstacle_m)
     return {
-        "rgb": np.moveaxis(view.rgb, -1, 0).astype(np.float32) / 255,
+        "rgb": np.moveaxis(view.rgb, -1, 0),
         "depth": view.depth[None].astype(np.float32),
-        "zero": zero.astype(np.float32),
-        "target": target.astype(np.float32),
-        "aux": np.stack([obstacle, surface & ~obstacle]).astype(np.float32),
-        "fov": view.fov[None].astype(np.float32),
+        "zero": zero,
+        "target": target,
+        "aux": np.stack([obstacle, surface & ~obstacle]),
+        "fov": view.fov[None],
         "scene": np.int64(scene),
     }
 
@@ -274,3 +276,15 @@ def view_sample(view: View, camera: CameraConfig, scene: int, zero: np.ndarray, 
 def collate(samples: list[Sample]) -> dict[str, torch.Tensor]:
     """Stack samples into a batch."""
     return {name: torch.from_numpy(np.stack([sample[name] for sample in samples])) for name in samples[0]}
+
+
+def as_float(batch: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The batch with masks as float32 in {0, 1} and images as float32 in [0, 1], on its device."""
+    return {
+        name: value.float() / 255
+        if value.dtype == torch.uint8
+        else value.float()
+        if value.dtype == torch.bool
+        else value
+        for name, value in batch.items()
+    }

@@ -19,7 +19,7 @@ from zerobev.common.errors import InputError
 from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
 from zerobev.config import LABELS, CameraConfig, TextureConfig
-from zerobev.data.samples import class_masks, collate, view_sample
+from zerobev.data.samples import as_float, class_masks, collate, view_sample
 from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import Predictor, evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
@@ -40,7 +40,9 @@ def render_views(folder: Path, number: int, views: int, camera: CameraConfig, se
     rng = np.random.default_rng([seed, zlib.crc32(folder.name.encode())])
     source = ViewSource(scene, camera, TextureConfig(), rng)
     drawn = [source.draw() for _ in range(views)]
-    return collate([view_sample(view, camera, number, *class_masks(view, scene.instance_label)) for view in drawn])
+    return as_float(
+        collate([view_sample(view, camera, number, *class_masks(view, scene.instance_label)) for view in drawn])
+    )
 
 
 def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict[str, Counts], dict[str, str]]:

@@ -15,7 +15,7 @@ from skimage.segmentation import find_boundaries
 
 from zerobev.common.progress import progress
 from zerobev.config import LABELS, NO_LABEL, CameraConfig, TextureConfig
-from zerobev.data.samples import Pair, collate, view_sample
+from zerobev.data.samples import Pair, as_float, collate, view_sample
 from zerobev.data.views import View, ViewSource
 from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, iou_per_class
@@ -88,7 +88,7 @@ def evaluate_unseen(folders: Iterable[Path], views: int = VIEWS) -> dict[str, Co
             view = source.draw()
             masks = unseen_masks(view, scene.instance_label, camera, rng)
             zero, target = (np.concatenate(images) for images in zip(*masks.values()))
-            batch = collate([view_sample(view, camera, number, zero, target)])
+            batch = as_float(collate([view_sample(view, camera, number, zero, target)]))
             ends = np.cumsum([len(images) for images, _ in masks.values()])[:-1]
             for row, projector in projectors.items():
                 counts = evaluate(projector.predict, [batch], len(folders), len(zero))

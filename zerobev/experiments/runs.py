@@ -22,6 +22,7 @@ from zerobev.data.samples import (
     SemanticSamples,
     SynthSamples,
     ViewSet,
+    as_float,
     collate,
     semantic_sample,
 )
@@ -149,7 +150,7 @@ class Run:
         record = RunRecord(self.key, plain(self.config), origin(device, revision), cost, result)
         if rank > 0:
             return record
-        batch = collate([semantic_sample(test, i, camera) for i in gallery_indices(test)])
+        batch = as_float(collate([semantic_sample(test, i, camera) for i in gallery_indices(test)]))
         with torch.inference_mode():
             maps = predict(batch).cpu()
         store.write(record, ((maps if maps.dtype == torch.bool else maps > 0) & (batch["fov"] > 0.5)).numpy())

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
-from zerobev.data.samples import ViewSampler, ViewSet
+from zerobev.data.samples import ViewSampler, ViewSet, as_float
 from zerobev.models.depth import DepthEstimator
 from zerobev.training.history import History
 from zerobev.training.losses import Losses
@@ -33,7 +33,7 @@ class DepthSamples:
         self._order = ViewSampler(len(views), seed)
 
     def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
-        """`rgb` (B, 3, H, W) in [0, 1] and `depth` (B, 1, H, W) metres, of a training step."""
+        """`rgb` (B, 3, H, W) uint8 and `depth` (B, 1, H, W) float32, metres, of a training step."""
         first = step * self._batch
         return _collated([self.sample(i) for i in range(first + rank, first + self._batch, ranks)])
 
@@ -109,7 +109,7 @@ def predict_depth(estimator: DepthEstimator, views: ViewSet, device: torch.devic
 
 
 def _views_batch(views: ViewSet, first: int) -> dict[str, Tensor]:
-    return _collated([_pair(views, i) for i in range(first, min(first + _BATCH, len(views)))])
+    return as_float(_collated([_pair(views, i) for i in range(first, min(first + _BATCH, len(views)))]))
 
 
 def _pair(views: ViewSet, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -120,6 +120,6 @@ def _pair(views: ViewSet, index: int) -> tuple[np.ndarray, np.ndarray]:
 def _collated(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Tensor]:
     rgb, depth = (np.stack(images) for images in zip(*pairs))
     return {
-        "rgb": torch.from_numpy(np.moveaxis(rgb, -1, 1).astype(np.float32) / 255),
+        "rgb": torch.from_numpy(np.ascontiguousarray(np.moveaxis(rgb, -1, 1))),
         "depth": torch.from_numpy(depth[:, None].astype(np.float32)),
     }

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from zerobev.common.errors import InputError
+from zerobev.data.samples import as_float
 
 #: More read no faster from one disk.
 _MAX_WORKERS = 16
@@ -80,8 +81,8 @@ def model_inputs(batch: Batch) -> list[Tensor]:
 
 
 def moved(batch: Batch, device: torch.device) -> Batch:
-    """The batch on the device."""
-    return {name: value.to(device, non_blocking=True) for name, value in batch.items()}
+    """The batch on the device, and only there as floats."""
+    return as_float({name: value.to(device, non_blocking=True) for name, value in batch.items()})
 
 
 def gpu_workers() -> int:

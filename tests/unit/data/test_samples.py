@@ -17,6 +17,7 @@ from zerobev.data.samples import (
     SemanticSamples,
     SynthSamples,
     ViewSet,
+    as_float,
     collate,
     extruded_texels,
     semantic_batches,
@@ -60,19 +61,19 @@ def views(folder) -> ViewSet:
 
 
 def stream(
-    name: str, views: ViewSet, bank: TextureBank, seed: int = 1, batch: int = 6, blank: float = 0.0
+    name: str, views: ViewSet, bank: TextureBank, seed: int = 1, batch: int = 6, empty_fraction: float = 0.0
 ) -> SampleStream:
     if name in ("synth", "paper"):
-        return SynthSamples(views, bank, CAMERA, seed, batch, blank, fresh=name == "synth")
+        return SynthSamples(views, bank, CAMERA, seed, batch, empty_fraction, fresh=name == "synth")
     kind = {"modsem": ModSemSamples, "depth": DepthProjSamples, "semantic": SemanticSamples}[name]
-    return kind(views, CAMERA, seed, batch, blank)
+    return kind(views, CAMERA, seed, batch, empty_fraction)
 
 
 def views_of_samples(views: ViewSet, samples: list[dict]) -> list[View]:
     """The view that each sample was made of."""
     view_of = {view.rgb.tobytes(): view for _, view in (views.locate(i) for i in range(len(views)))}
     assert len(view_of) == len(views)
-    rgb = [np.round(np.moveaxis(sample["rgb"], 0, -1) * 255).astype(np.uint8) for sample in samples]
+    rgb = [np.moveaxis(sample["rgb"], 0, -1) for sample in samples]
     return [view_of[image.tobytes()] for image in rgb]
 
 
@@ -94,17 +95,20 @@ def test_batch_has_the_documented_form(views, bank, name):
     modalities = len(LABELS) if name == "semantic" else 1
     shapes = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in batch.items()}
     assert shapes == {
-        "rgb": ((6, 3, 24, 24), torch.float32),
-        "zero": ((6, modalities, 24, 24), torch.float32),
+        "rgb": ((6, 3, 24, 24), torch.uint8),
+        "zero": ((6, modalities, 24, 24), torch.bool),
         "depth": ((6, 1, 24, 24), torch.float32),
-        "target": ((6, modalities, 20, 20), torch.float32),
-        "aux": ((6, 2, 20, 20), torch.float32),
-        "fov": ((6, 1, 20, 20), torch.float32),
+        "target": ((6, modalities, 20, 20), torch.bool),
+        "aux": ((6, 2, 20, 20), torch.bool),
+        "fov": ((6, 1, 20, 20), torch.bool),
         "scene": ((6,), torch.int64),
     }
+    floats = as_float(batch)
+    assert {tensor.dtype for name, tensor in floats.items() if name != "scene"} == {torch.float32}
     for image in ("zero", "target", "aux", "fov"):
-        assert set(batch[image].unique().tolist()) == {0.0, 1.0}
-    assert batch["rgb"].min() >= 0 and 0.5 < batch["rgb"].max() <= 1
+        assert set(floats[image].unique().tolist()) == {0.0, 1.0}
+    assert np.array_equal(floats["rgb"].numpy(), batch["rgb"].numpy().astype(np.float32) / 255)
+    assert 0.5 < floats["rgb"].max() <= 1
 
 
 @pytest.mark.parametrize("name", STREAMS)
@@ -135,7 +139,7 @@ def test_every_epoch_is_a_permutation_of_the_views(views, bank, name):
     order = []
     for i in range(3 * len(views)):
         sample = data.sample(i)
-        rgb = np.round(np.moveaxis(sample["rgb"], 0, -1) * 255).astype(np.uint8)
+        rgb = np.moveaxis(sample["rgb"], 0, -1)
         order.append(index_of[rgb.tobytes()])
         assert sample["scene"] == (order[-1] >= COUNTS[0])
     epochs = np.array(order).reshape(3, -1)
@@ -223,14 +227,14 @@ def test_modsem_is_white_on_instances_alone(views, bank):
 
 
 def test_depth_proj_is_the_projection_of_its_rectangles(views, bank):
-    batch = stream("depth", views, bank, batch=20).batch(0)
+    batch = as_float(stream("depth", views, bank, batch=20).batch(0))
     assert torch.equal(batch["target"], inverse_project(batch["zero"], batch["depth"], CAMERA))
     assert (batch["target"] <= batch["fov"]).all()  # nothing is known that was not seen
     assert len({image.numpy().tobytes() for image in batch["zero"]}) == 20
 
 
 def test_semantic_tuples_are_the_samples_of_the_evaluation(views, bank):
-    batch = stream("semantic", views, bank, batch=len(views)).batch(0)
+    batch = as_float(stream("semantic", views, bank, batch=len(views)).batch(0))
     evaluated = next(semantic_batches(views, CAMERA, len(views)))
     order = [(evaluated["rgb"] == rgb).flatten(1).all(dim=1).nonzero().item() for rgb in batch["rgb"]]
     assert sorted(order) == list(range(len(views)))
@@ -258,7 +262,7 @@ def test_depth_may_be_replaced(views, bank, dtype):
         assert scene == same_scene and view.depth.dtype == np.float32
         assert np.array_equal(view.depth, maps[scene][i - scene * COUNTS[0]])
         assert np.array_equal(view.rgb, given.rgb) and not np.array_equal(view.depth, given.depth)
-    batch, given = (stream("depth", each, bank).batch(0) for each in (predicted, views))
+    batch, given = (as_float(stream("depth", each, bank).batch(0)) for each in (predicted, views))
     assert torch.equal(batch["target"], inverse_project(batch["zero"], batch["depth"], CAMERA))
     assert torch.equal(batch["zero"], given["zero"]) and not torch.equal(batch["target"], given["target"])
     with pytest.raises(InputError, match=r"depth maps: expected \[5, 3\] views a shard, found \[3, 5\]"):
@@ -309,7 +313,7 @@ def test_classes_are_disjoint_and_are_the_labels_of_what_is_seen(views):
             assert np.array_equal(label, of_instance[instance])
             seen |= {LABELS[value] for value in np.unique(label) if value >= 0}
     assert seen == {"wall", "floor", "bed", "chair", "tv"}
-    assert same(collate([semantic_sample(views, 4, CAMERA)]), {name: whole[name][4:5] for name in whole})
+    assert same(as_float(collate([semantic_sample(views, 4, CAMERA)])), {name: whole[name][4:5] for name in whole})
 
 
 def test_auxiliary_maps_split_the_surfaces_at_ten_centimetres():

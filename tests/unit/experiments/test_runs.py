@@ -11,7 +11,7 @@ import torch
 from zerobev.common.errors import InputError
 from zerobev.common.keys import plain
 from zerobev.config import SCALES, SceneConfig, TextureConfig, TrainConfig
-from zerobev.data.samples import semantic_batches
+from zerobev.data.samples import as_float, semantic_batches
 from zerobev.experiments import runs
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.gallery import gallery
@@ -112,7 +112,7 @@ def test_each_row_is_trained_on_the_auxiliary_maps_that_it_names(workspace, monk
         run = Run(EXPERIMENTS[row], workspace)
         run.train()
         model, objective = objectives["pair"]
-        batch = run.source("train", "true", 0).batch(0)
+        batch = as_float(run.source("train", "true", 0).batch(0))
         with torch.no_grad():
             logits = model(batch["rgb"], batch["zero"]).aux_logits
             expected = dice_loss(logits.sigmoid(), batch["aux"][:, channels], batch["fov"])

@@ -19,7 +19,7 @@ from transformers import (
 
 from zerobev.common.errors import InputError
 from zerobev.config import SCALES, TrainConfig
-from zerobev.data.samples import ViewSet
+from zerobev.data.samples import ViewSet, as_float
 from zerobev.data.views import View
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
 from zerobev.models.backbone_weights import load_backbone
@@ -76,7 +76,7 @@ class Red(nn.Module):
 
 
 def test_photograph_and_depth_are_mirrored_together_half_of_the_time():
-    batch = DepthSamples(recorded(30, 34), seed=0, batch=64).batch(0)
+    batch = as_float(DepthSamples(recorded(30, 34), seed=0, batch=64).batch(0))
     torch.testing.assert_close(batch["depth"], batch["rgb"][:, :1] * 255 / 64)
     mirrored = batch["depth"][..., 0] > batch["depth"][..., -1]
     assert 20 < int(mirrored[:, 0, 0].sum()) < 44

@@ -11,7 +11,7 @@ import torch
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig, TextureConfig
-from zerobev.data.samples import SemanticPass, SynthSamples, ViewSet
+from zerobev.data.samples import SemanticPass, SynthSamples, ViewSet, as_float
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank
 from zerobev.data.views import ViewSource
@@ -50,7 +50,7 @@ def same(one: list, other: list) -> bool:
 @pytest.mark.parametrize("workers", [0, 1, 2])
 def test_workers_change_nothing(source, workers):
     for place in ((0, 1), (1, 2)):
-        expected = [source.batch(step, *place) for step in range(5, 12)]
+        expected = [as_float(source.batch(step, *place)) for step in range(5, 12)]
         torch.manual_seed(0)
         assert same(list(batches(source, range(5, 12), CPU, place, workers)), expected)
         assert torch.initial_seed() == 0 and torch.rand(1) == torch.rand(1, generator=torch.manual_seed(0))
@@ -60,7 +60,7 @@ def test_a_pass_over_the_test_views_is_shared_by_batches(views):
     source = SemanticPass(views, CAMERA, 5)
     assert len(source) == 3
     halves = [list(batches(source, range(rank, len(source), 2), CPU, workers=1)) for rank in (0, 1)]
-    assert same([halves[0][0], halves[1][0], halves[0][1]], [source.batch(number) for number in range(3)])
+    assert same([halves[0][0], halves[1][0], halves[0][1]], [as_float(source.batch(number)) for number in range(3)])
     scenes = torch.cat([batch["scene"] for half in halves for batch in half])
     assert scenes.bincount().tolist() == [6, 6]
 
