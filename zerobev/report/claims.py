@@ -6,6 +6,7 @@ scenes differ. A verdict stands on means over seeds with a 90 % bootstrap interv
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -23,6 +24,10 @@ _OBJECTS = [LABELS.index(name) for name in LABELS if name not in ("wall", "floor
 Measure = Callable[[np.ndarray], np.ndarray]
 
 
+VerdictName = Literal["holds", "does not hold", "undecided", "not run"]
+VERDICTS: tuple[VerdictName, ...] = get_args(VerdictName)
+
+
 @dataclass(frozen=True)
 class Verdict:
     """A claim of the paper, held against our records."""
@@ -34,7 +39,7 @@ class Verdict:
     ours: float | None
     low: float | None  #: 90 % interval over test scenes and seeds
     high: float | None
-    verdict: str  #: "holds", "does not hold", "undecided", or "not run"
+    verdict: VerdictName
 
 
 def judge(claim: Ordering | Similar, records: Sequence[RunRecord]) -> Verdict:
@@ -55,8 +60,8 @@ def judge(claim: Ordering | Similar, records: Sequence[RunRecord]) -> Verdict:
     if found is None:
         return Verdict(claim.id, claim.table, text, paper, None, None, None, "not run")
     ours, low, high = (round(100 * value, 1) for value in found)
-    # judged on what is not rounded
-    lowest, highest = 100 * found[1], 100 * found[2]
+    lowest, highest = 100 * found[1], 100 * found[2]  # the verdict is on values before rounding
+    verdict: VerdictName
     if isinstance(claim, Ordering):
         verdict = "holds" if lowest > 0 else "does not hold" if highest < 0 else "undecided"
     else:

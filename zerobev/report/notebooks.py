@@ -1,8 +1,9 @@
 """Run the whole workbook.
 
-Reads `notebooks/` and the records of `reports/<report>/`. Every notebook is executed in order with the scale and the
-scenes as its parameters; the executed copies and their HTML go to `reports/<report>/notebooks/`, messages of kernels to
-`reports/<report>/logs/`. After an interruption the same command goes on: recorded results are read.
+Reads `notebooks/` and the records of `reports/<report>/`; writes the executed copies and their HTML into
+`reports/<report>/notebooks/`, and messages of kernels into `reports/<report>/logs/`. Every notebook is executed in
+order, with the scale and the scenes as its parameters. After an interruption the same command goes on: recorded results
+are read.
 """
 
 import argparse

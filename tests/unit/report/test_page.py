@@ -45,7 +45,7 @@ def report(tmp_path, monkeypatch):
     """A workspace with records of three rows, (c) with two seeds."""
     records = [record("a.1", BASE), record("c", BASE + 4), record("c", BASE + 6, seed=1), record("f", BASE + 9)]
     monkeypatch.setattr(summary, "recorded", lambda rows, workspace: records)
-    monkeypatch.setattr(summary, "_gallery", lambda *_: "")
+    monkeypatch.setattr(summary, "_gallery", lambda *_: None)
     workspace = Workspace("smoke", root=tmp_path)
     write_summary(workspace)
     return workspace.reports, records

@@ -9,7 +9,6 @@ from matplotlib.colors import to_rgb
 
 from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.records import Record
 from zerobev.report.claims import judge
 from zerobev.report.figures import COLORS, flat, label_image, maps_image, top_view
 from zerobev.report.own_rows import OWN_CLAIMS
@@ -17,7 +16,7 @@ from zerobev.report.paper import CLAIMS, TABLES
 from zerobev.report.tables import Checks, scoreboard, table, verdict_table
 
 from support.paths import ROOT
-from support.records import record
+from support.records import record, run_record
 from support.scenes import box, build, room
 
 ROWS = TABLES[1]
@@ -56,7 +55,7 @@ def test_table_by_hand():
 def test_pixel_average_weighs_by_area_and_class_average_does_not():
     union = np.array([[100, 900, 0, 0, 0, 0, 0, 0]])
     counts = Counts(union * [[1, 0, 0, 0, 0, 0, 0, 0]], union)
-    one = Record("c-0", "c", 0, {}, {}, {}, ["scene"], counts, {})
+    one = run_record("c-0", counts)
     ours = table(1, [one]).xs(("c", "ours"), level=("row", "source")).iloc[0]
     assert ours["class avg."] == 50 and ours["pixel avg."] == 10
     assert ours[["wall", "floor"]].tolist() == [100, 0] and ours[list(LABELS[2:])].isna().all()
