@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
-from support.paths import ROOT
 from zerobev import cli
+
+from support.paths import ROOT
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
@@ -39,5 +40,5 @@ def test_an_unknown_command_and_bad_input_are_one_line(capsys):
 
 def test_a_missing_package_is_named_with_what_installs_it(monkeypatch):
     monkeypatch.setitem(cli.COMMANDS, "homes", ("missing_package", "write homes"))
-    with pytest.raises(SystemExit, match="`zerobev homes` needs the package missing_package, .*install zerobev"):
+    with pytest.raises(SystemExit, match=r"`zerobev homes` needs the package missing_package, .*install zerobev"):
         cli.main(["homes"])
