@@ -39,7 +39,7 @@ from zerobev.training.precision import computes_bfloat16
 from zerobev.training.schedule import Schedule
 
 CHECKPOINT_SECONDS = 60  #: between two checkpoints, beside those at validations
-HISTORY_ENTRIES = 1000  #: about as many are kept of a run, beside those at validations
+HISTORY_ENTRIES = 200  #: about as many are kept per run, beside those at validations
 
 Objective = Callable[[nn.Module, Batch], Losses]
 Picture = Callable[[nn.Module, Batch], Figure]
@@ -127,6 +127,7 @@ class _Run:
         self.best_step, self.best_score = 0, float("inf")
         self.entries: list[Entry] = []
         self.window: list[list[float]] = []  # losses since the last entry
+        self.unread: list[Tensor] = []  # the last of them, still on the device
         self.learning_rate = config.learning_rate  # of the last step
         self._seconds_before, self._started = 0.0, time.monotonic()
         self._saved_at = self._started
@@ -145,10 +146,8 @@ class _Run:
         self.optimizer.zero_grad()
         self.schedule.step()
         self.step += 1
-        values = self._means(torch.stack([value.detach() for value in losses if value is not None])).tolist()
-        if not np.isfinite(values).all():
-            raise FloatingPointError(f"step {self.step}: expected finite losses, found {values}")
-        self.window.append(values)
+        # read later: reading a GPU's result at every step would make it wait for the next one
+        self.unread.append(self._means(torch.stack([value.detach() for value in losses if value is not None])))
 
     def validate(self, objective: Objective, batches: Sequence[Batch]) -> None:
         """Score the model, keep it if it is the best so far, and save a checkpoint."""
@@ -177,8 +176,20 @@ class _Run:
         if picture is not None:
             write_picture(picture(self.bare, moved(batch, self.accelerator.device)), self.folder / "sample.png")
 
+    def read_losses(self) -> None:
+        """Move the losses of the last steps into the window; a `FloatingPointError` if one is not finite."""
+        if not self.unread:
+            return
+        first = self.step - len(self.unread) + 1
+        for step, values in enumerate(torch.stack(self.unread).tolist(), first):
+            if not np.isfinite(values).all():
+                raise FloatingPointError(f"step {step}: expected finite losses, found {values}")
+            self.window.append(values)
+        self.unread.clear()
+
     def record(self, score: float | None) -> None:
         """Add an entry to the history, its file and the log."""
+        self.read_losses()
         total, main, *aux = np.mean(self.window, axis=0).tolist()
         entry = Entry(self.step, total, main, aux[0] if aux else None, self.learning_rate, self.seconds, score)
         self.window.clear()
@@ -196,6 +207,7 @@ class _Run:
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
+        self.read_losses()
         self._saved_at = time.monotonic()
         if not self.accelerator.is_main_process:
             return
