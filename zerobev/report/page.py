@@ -22,13 +22,14 @@ import nbformat
 import pandas as pd
 from matplotlib.figure import Figure
 
+from zerobev.common.paths import PACKAGE_PARENT
 from zerobev.common.storage import replacing, write_json
 from zerobev.config import SCALES
 from zerobev.experiments.gallery import gallery
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.experiments.runs import SEEDS, recorded
-from zerobev.experiments.workspace import ROOT, Workspace
+from zerobev.experiments.workspace import Workspace
 from zerobev.report.claims import Verdict, compare, judge
 from zerobev.report.figures import averages_figure, gallery_figure
 from zerobev.report.own_rows import OWN_CLAIMS
@@ -164,9 +165,12 @@ def _gallery(workspace: Workspace, records: Sequence[RunRecord]) -> str:
 def _any_modality(workspace: Workspace) -> list[str]:
     """The figures of notebook 11 as it was executed last, each under the heading that it stands under."""
     name = "11_any_modality.ipynb"
-    executed = [folder / name for folder in (workspace.reports / "notebooks", ROOT / "notebooks")]
-    notebook = nbformat.read(next(path for path in executed if path.exists()), as_version=4)
+    executed = [folder / name for folder in (workspace.reports / "notebooks", PACKAGE_PARENT / "notebooks")]
+    found = next((path for path in executed if path.exists()), None)
     sections, heading, count = ["<h2>Any modality</h2>"], "", 0
+    if found is None:
+        return [*sections, f"<p>Notebook {name} was not executed.</p>"]
+    notebook = nbformat.read(found, as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             heading = next((line[3:] for line in cell.source.splitlines() if line.startswith("## ")), heading)
