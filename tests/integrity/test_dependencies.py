@@ -20,7 +20,7 @@ GROUPS = ("core", "scenes", "workbook", "dev")
 #: module or room of zerobev -> group; all others are core.
 GROUP_OF = {
     **dict.fromkeys(["common.parallel", "scenes", "rendering", "data", "evaluation"], "scenes"),
-    **dict.fromkeys(["training", "experiments", "benchmarks", "report", "cli", "__main__"], "workbook"),
+    **dict.fromkeys(["training", "experiments", "benchmarks", "report"], "workbook"),
 }
 #: Commands and plug-ins, which no module imports.
 TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "setuptools"}

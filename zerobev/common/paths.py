@@ -10,6 +10,11 @@ PACKAGE_PARENT = Path(__file__).resolve().parents[2]
 _CHECKOUT = ("pyproject.toml", "Makefile", "notebooks")
 
 
+def checkout() -> Path | None:
+    """The project's folder that holds the package; None for an installed package."""
+    return PACKAGE_PARENT if all((PACKAGE_PARENT / name).exists() for name in _CHECKOUT) else None
+
+
 def zerobev_home() -> Path:
     """The folder of `.cache` and `reports`, an absolute path; it may not exist yet.
 
@@ -22,6 +27,4 @@ def zerobev_home() -> Path:
         if folder.exists() and not folder.is_dir():
             raise InputError(f"ZEROBEV_HOME: expected a folder, found a file at {folder}")
         return folder
-    if all((PACKAGE_PARENT / name).exists() for name in _CHECKOUT):
-        return PACKAGE_PARENT
-    return Path.cwd()
+    return checkout() or Path.cwd()

@@ -16,7 +16,7 @@ from zerobev.common.errors import InputError
 from zerobev.common.keys import fingerprint
 from zerobev.common.paths import zerobev_home
 from zerobev.common.settings import changed_by
-from zerobev.config import Split, TextureConfig
+from zerobev.config import SPLITS, Split, TextureConfig
 from zerobev.data.generate import generate, shard_path
 from zerobev.data.patterns import SourceImages
 from zerobev.data.samples import ViewSet
@@ -66,8 +66,9 @@ class Workspace:
             "scenes": self.scale.scenes,
         }
         if self.source:
-            files = sorted(f for f in self.source.rglob("*.semantic.*") if f.is_file())
-            found["source"] = {f.name: f.stat().st_size for f in files}
+            folders = {folder for split in SPLITS for folder in self.split.of(split)}
+            files = sorted(file for folder in folders for file in folder.iterdir() if file.is_file())
+            found["source"] = {f"{file.parent.name}/{file.name}": file.stat().st_size for file in files}
         return found
 
     def texture_config(self, texture: TextureConfig) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The folder of data and reports, for a checkout, an installed package and a choice of the user."""
 
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from zerobev.common import paths
 from zerobev.common.errors import InputError
 from zerobev.common.paths import zerobev_home
+from zerobev.experiments import release
 from zerobev.experiments.workspace import Workspace
 from zerobev.report.notebooks import kernel_settings
 
@@ -26,6 +28,8 @@ def test_an_installed_package_writes_to_the_working_folder(monkeypatch, tmp_path
     monkeypatch.chdir(tmp_path)
     assert zerobev_home() == tmp_path
     assert Workspace("smoke").cache == tmp_path / ".cache"
+    with pytest.raises(InputError, match="release: expected a checkout"):
+        release.run(Namespace())  # would write beside the package
 
 
 def test_the_users_choice_comes_first_and_reaches_kernels_as_an_absolute_path(monkeypatch, tmp_path):

@@ -54,6 +54,8 @@ def test_another_data_set_is_read_and_recorded(rooms, tmp_path):
     assert workspace.split.test == (rooms / "room-2",)
     scene = workspace.scene("test", 0)
     assert scene.name == "room-2" and scene.vertices[:, 0].max() == 6
+    files = {f"room-{number}/side.txt": 1 for number in range(3)}
+    assert workspace.data_config["source"] == files  # other files, other views
     assert generate([rooms / "room-0"], tmp_path / "shards", 2, CAMERA, TEXTURE, seed=0) == {}
     assert len(Shard(tmp_path / "shards/room-0.h5", CAMERA, TEXTURE)) == 2
 
