@@ -15,6 +15,7 @@ from packaging.utils import canonicalize_name
 from support.paths import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DISTRIBUTIONS = packages_distributions()
 #: Each holds those before it.
 GROUPS = ("core", "scenes", "workbook", "dev")
 #: module or room of zerobev -> group; all others are core.
@@ -53,8 +54,7 @@ def imported(source: str) -> set[str]:
 def distributions(names: set[str]) -> set[str]:
     """The distributions of imported modules, but for the standard library, zerobev and the tests' own."""
     roots = {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"zerobev", "support"}
-    known = packages_distributions()
-    return {canonicalize_name(known[root][0]) for root in roots}
+    return {canonicalize_name(DISTRIBUTIONS[root][0]) for root in roots}
 
 
 def module_of(path: Path) -> str:
