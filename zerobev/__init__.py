@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from zerobev.inference import BevArrows, BevMap, Boxes, Flow, Projector, load
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = ["BevArrows", "BevMap", "Boxes", "Flow", "Projector", "load"]
 

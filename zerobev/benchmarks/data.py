@@ -26,9 +26,9 @@ from zerobev.data.views import View, ViewSource
 from zerobev.geometry.cameras import Pose
 from zerobev.geometry.projection import inverse_project_mask
 from zerobev.rendering.rerender import Rerenderer
-from zerobev.scenes.hm3dsem import read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 from zerobev.scenes.indoor import generate_home
+from zerobev.scenes.readers import read_scene
 from zerobev.scenes.scene import Scene
 
 DENSITIES = (0.10, 0.15, 0.20, 0.25, 0.30)  #: shares of white texels (paper, Table 4)

@@ -33,7 +33,7 @@ from zerobev.experiments.runs import SEEDS, Run
 from zerobev.experiments.workspace import Workspace
 from zerobev.models import build
 from zerobev.models.depth import DepthNet
-from zerobev.scenes.hm3dsem import read_scene
+from zerobev.scenes.readers import read_scene
 from zerobev.training.depth import DepthSamples, depth_objective
 from zerobev.training.loader import Source, gpu_workers, model_inputs, moved
 from zerobev.training.train import Objective, dice_objective, training_accelerator

@@ -26,7 +26,7 @@ from zerobev.common.storage import write_json
 from zerobev.config import SCALES, SPLITS, CameraConfig, TextureConfig, scale
 from zerobev.data.shards import Shard, checksum, recorded_with, write_shard
 from zerobev.data.views import ViewSource
-from zerobev.scenes.hm3dsem import read_scene, split_scenes
+from zerobev.scenes.readers import read_scene, split_scenes
 
 _MANIFEST = "manifest.json"
 

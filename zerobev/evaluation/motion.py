@@ -24,8 +24,8 @@ from zerobev.inference.shipped_weights import ROWS
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer
 from zerobev.rendering.poses import navigable_floor
-from zerobev.scenes.hm3dsem import read_scene
 from zerobev.scenes.moving import movable, moved
+from zerobev.scenes.readers import read_scene
 from zerobev.scenes.scene import Scene
 
 #: Side of the photographs: flow needs finer ones than the networks do.

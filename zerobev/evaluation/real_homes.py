@@ -26,7 +26,7 @@ from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pi
 from zerobev.geometry.projection import inverse_project
 from zerobev.inference.projector import GEOMETRIC, load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
-from zerobev.scenes.hm3dsem import find_scenes, read_scene
+from zerobev.scenes.readers import find_scenes, read_scene
 
 ORACLE = "a.1"
 METHODS = {ORACLE: "P^-1 with true depth", GEOMETRIC: "P^-1 with estimated depth"} | {

@@ -22,7 +22,7 @@ from zerobev.evaluation.metrics import Counts, bootstrap_interval, iou_per_class
 from zerobev.geometry.projection import map_points
 from zerobev.inference.projector import GEOMETRIC, load
 from zerobev.inference.shipped_weights import ROWS
-from zerobev.scenes.hm3dsem import read_scene
+from zerobev.scenes.readers import read_scene
 
 #: name -> what is white
 MODALITIES = {

@@ -13,17 +13,19 @@ _PACKAGES = ("torch", "numpy", "transformers", "accelerate", "embreex", "pyrende
 
 
 def git_revision(code: Path = Path(__file__).parents[1]) -> str:
-    """The commit that `code` is checked out at, with "-dirty" if it differs; "unknown" outside a checkout.
+    """The commit that `code` is checked out at, with "-dirty" if it differs; "unknown" if git does not track `code`.
 
     Only changes below `code` count: a reproduction writes reports and notebooks.
     """
-    commands = ["describe", "--always", "--abbrev=12"], ["status", "--porcelain", "."]
+    commands = ["describe", "--always", "--abbrev=12"], ["status", "--porcelain", "."], ["ls-files", "."]
     try:
         found = [subprocess.run(["git", *c], cwd=code, capture_output=True, text=True, check=False) for c in commands]
     except FileNotFoundError:  # no git
         return "unknown"
-    revision, changes = (ended.stdout.strip() for ended in found)
-    return (revision + "-dirty" if changes else revision) or "unknown"
+    revision, changes, tracked = (ended.stdout.strip() for ended in found)
+    if not tracked:  # no repository, or an environment inside that of another project
+        return "unknown"
+    return revision + "-dirty" if changes else revision
 
 
 def origin(device: str, revision: str) -> dict[str, Any]:

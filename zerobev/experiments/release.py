@@ -13,6 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from zerobev.common.errors import InputError
+from zerobev.common.paths import checkout
 from zerobev.common.storage import replacing
 from zerobev.experiments.registry import experiment
 from zerobev.experiments.runs import Run
@@ -70,5 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Write the weights into the package."""
+    """Write the weights into the package; an `InputError` outside a checkout."""
+    if checkout() is None:
+        raise InputError("release: expected a checkout of the project, found an installed package")
     write_weights()

@@ -14,31 +14,33 @@ import numpy as np
 from zerobev import config
 from zerobev.common.errors import InputError
 from zerobev.common.keys import fingerprint
+from zerobev.common.paths import zerobev_home
 from zerobev.common.settings import changed_by
-from zerobev.config import Split, TextureConfig
+from zerobev.config import SPLITS, Split, TextureConfig
 from zerobev.data.generate import generate, shard_path
 from zerobev.data.patterns import SourceImages
 from zerobev.data.samples import ViewSet
 from zerobev.data.shards import Shard, recorded_with
 from zerobev.data.textures import TextureBank
 from zerobev.experiments import versions
-from zerobev.scenes.hm3dsem import SceneFolders, read_scene, split_scenes
+from zerobev.scenes.hm3dsem import SceneFolders
 from zerobev.scenes.homes import ensure_home, ensure_homes, home_folders
+from zerobev.scenes.readers import read_scene, split_scenes
 from zerobev.scenes.scene import Scene
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 class Workspace:
     """Scenes, views and textures of a scale, from generated homes or from a folder of scenes."""
 
-    def __init__(self, scale: str, scenes: str = "", root: Path = ROOT, settings: Sequence[str] = ()) -> None:
+    def __init__(self, scale: str, scenes: str = "", root: Path | None = None, settings: Sequence[str] = ()) -> None:
         """Choose the scale and the scenes; nothing is made yet.
 
         scale: a name in `config.SCALES`
         scenes: a folder in HM3DSem layout; "" for generated homes
+        root: the folder of `.cache` and `reports`; default: `common.paths.zerobev_home()`
         settings: values of the scale that are changed, such as `train.steps=2400`, see `common.settings`
         """
+        root = root or zerobev_home()
         self._arguments = scale, scenes, root
         self.has_settings = bool(settings)
         self.scale = changed_by(config.scale(scale), settings)
@@ -64,8 +66,9 @@ class Workspace:
             "scenes": self.scale.scenes,
         }
         if self.source:
-            files = sorted(f for f in self.source.rglob("*.semantic.*") if f.is_file())
-            found["source"] = {f.name: f.stat().st_size for f in files}
+            folders = {folder for split in SPLITS for folder in self.split.of(split)}
+            files = sorted(file for folder in folders for file in folder.iterdir() if file.is_file())
+            found["source"] = {f"{file.parent.name}/{file.name}": file.stat().st_size for file in files}
         return found
 
     def texture_config(self, texture: TextureConfig) -> dict[str, Any]:

@@ -26,11 +26,11 @@ from nbformat import NotebookNode
 from papermill.exceptions import PapermillExecutionError
 
 from zerobev.common.errors import InputError
+from zerobev.common.paths import PACKAGE_PARENT, zerobev_home
 from zerobev.common.storage import replacing
 from zerobev.config import SCALES, one_of
 
-ROOT = Path(__file__).resolve().parents[2]
-CACHE = ROOT / ".cache"
+NOTEBOOKS = PACKAGE_PARENT / "notebooks"
 
 
 class NotebookError(Exception):
@@ -45,9 +45,9 @@ def report_name(scale: str, scenes: Path | None) -> str:
 def kernel_settings() -> dict[str, str]:
     """Environment variables of every notebook kernel; the folders they name are made.
 
-    They name this environment's own kernel, let figures appear in the notebook, find the package from any folder,
-    and keep what Jupyter, IPython and matplotlib write inside the repository, so that neither the user's settings
-    nor a home that cannot be written change an output.
+    They name this environment's own kernel, let figures appear in the notebook, and let kernels find the package and
+    `zerobev_home()` from any folder. Jupyter, IPython and matplotlib write inside `zerobev_home()`, so that neither
+    the user's settings nor a home directory without write access change an output.
     """
     own = {
         "JUPYTER_CONFIG_DIR": "jupyter/config",
@@ -56,12 +56,14 @@ def kernel_settings() -> dict[str, str]:
         "IPYTHONDIR": "ipython",
         "MPLCONFIGDIR": "matplotlib",
     }
+    cache = zerobev_home() / ".cache"
     for folder in own.values():
-        (CACHE / folder).mkdir(parents=True, exist_ok=True)
+        (cache / folder).mkdir(parents=True, exist_ok=True)
     return {
-        **{variable: str(CACHE / folder) for variable, folder in own.items()},
+        **{variable: str(cache / folder) for variable, folder in own.items()},
         "JUPYTER_PATH": str(Path(sys.prefix) / "share" / "jupyter"),
-        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "ZEROBEV_HOME": str(zerobev_home()),
+        "PYTHONPATH": os.pathsep.join([str(PACKAGE_PARENT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
         # a progress bar of Jupyter widgets is not wanted, so that it cannot be had is no news
         "PYTHONWARNINGS": "ignore:IProgress not found",
@@ -133,7 +135,7 @@ def standard_error_in(log: Path) -> Iterator[None]:
 
 
 def execute(notebook: Path, executed: Path, logs: Path, parameters: dict[str, str]) -> NotebookNode:
-    """Execute `notebook` with `parameters`, from the repository's root, and write it to `executed` when it ran through.
+    """Execute `notebook` with `parameters`, from `zerobev_home()`, and write it to `executed` when it ran through.
 
     The output streams of its cells and the messages of its kernel go to `logs/<notebook>.log`, and on failure the
     traceback too. Raises `NotebookError`; then `executed` is not touched.
@@ -153,7 +155,7 @@ def execute(notebook: Path, executed: Path, logs: Path, parameters: dict[str, st
                     progress_bar=False,
                     stdout_file=streams,
                     stderr_file=streams,
-                    cwd=ROOT,
+                    cwd=zerobev_home(),
                     coalesce_streams=True,
                 )
         except PapermillExecutionError as error:
@@ -203,14 +205,15 @@ def reproduce(
     scenes: Path | None = None,
     textures: Path | None = None,
     fresh: bool = False,
-    notebooks: Path = ROOT / "notebooks",
-    reports: Path = ROOT / "reports",
+    notebooks: Path = NOTEBOOKS,
+    reports: Path | None = None,
 ) -> Path:
     """Execute every notebook of the folder `notebooks`, in order of name, and return the report's folder.
 
     scale: name of a scale, the notebooks' parameter `SCALE`.
     scenes: folder of HM3DSem scenes, the parameter `SCENES` as an absolute path; None (`""`) is generated homes.
     textures: folder of texture images; kernels find it in the environment variable `ZEROBEV_TEXTURES`.
+    reports: folder of the reports; default: `reports` in `common.paths.zerobev_home()`.
     fresh: compute again what is recorded; kernels find the time of this call, in seconds since 1970, in
         `ZEROBEV_FRESH`, and take no record that is older.
     Raises `InputError` before anything is executed, `NotebookError` at the first notebook that fails.
@@ -229,7 +232,7 @@ def reproduce(
     if fresh:
         variables["ZEROBEV_FRESH"] = str(time.time())
 
-    report = reports / report_name(scale, scenes)
+    report = (reports or zerobev_home() / "reports") / report_name(scale, scenes)
     executed, logs = report / "notebooks", report / "logs"
     with only_run(logs), environment(variables), shown_progress(logs / "progress.log"):
         shutil.rmtree(executed, ignore_errors=True)  # copies of an earlier run would pass for this one's
@@ -246,13 +249,13 @@ def first_picture(notebook: NotebookNode) -> bytes | None:
     return base64.b64decode(pictures[0]) if pictures else None
 
 
-def refresh(notebooks: Path = ROOT / "notebooks", reports: Path = ROOT / "reports") -> None:
+def refresh(notebooks: Path = NOTEBOOKS, reports: Path = PACKAGE_PARENT / "reports") -> None:
     """Execute every notebook of the folder again with its own parameters and put it, whole and clean, in its place.
 
     Clean: no trace of when and by what a notebook was executed, so that equal outputs are equal files. The first
     picture of the first notebook, the tour, is the README's: it goes to `reports/tour.png`.
     """
-    cache = CACHE / "notebooks"
+    cache = zerobev_home() / ".cache/notebooks"
     with only_run(cache), environment(kernel_settings()):
         for notebook in _progress(_notebooks_in(notebooks)):
             copy = execute(notebook, cache / notebook.name, cache, {})

@@ -22,13 +22,14 @@ import matplotlib.pyplot as plt
 import nbformat
 import pandas as pd
 
+from zerobev.common.paths import PACKAGE_PARENT
 from zerobev.common.storage import replacing, write_json
 from zerobev.config import SCALES
 from zerobev.experiments.gallery import gallery
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.experiments.runs import SEEDS, recorded
-from zerobev.experiments.workspace import ROOT, Workspace
+from zerobev.experiments.workspace import Workspace
 from zerobev.report.claims import VERDICTS, compare, judge
 from zerobev.report.figures import averages_figure, gallery_figure
 from zerobev.report.own_rows import OWN_CLAIMS
@@ -128,8 +129,11 @@ def _gallery(workspace: Workspace, records: Sequence[RunRecord]) -> Figure | Non
 def _any_modality(workspace: Workspace) -> list[Figure]:
     """The figures of notebook 11 in its last execution, each with the heading that it stands under."""
     name = "11_any_modality.ipynb"
-    executed = [folder / name for folder in (workspace.reports / "notebooks", ROOT / "notebooks")]
-    notebook = nbformat.read(next(path for path in executed if path.exists()), as_version=4)
+    executed = [folder / name for folder in (workspace.reports / "notebooks", PACKAGE_PARENT / "notebooks")]
+    found = next((path for path in executed if path.exists()), None)
+    if found is None:
+        return []
+    notebook = nbformat.read(found, as_version=4)
     figures: list[Figure] = []
     heading = ""
     for cell in notebook.cells:

@@ -198,5 +198,9 @@ def test_a_revision_is_dirty_where_the_code_was_changed(tmp_path):
     assert re.fullmatch("[0-9a-f]{12}", clean)
     report.write_text("{}")  # what a reproduction writes
     assert git_revision(code) == clean
+    installed = tmp_path / ".venv/code"  # in an environment inside a repository that ignores it
+    installed.mkdir(parents=True)
+    (tmp_path / ".gitignore").write_text(".venv/\n")
+    assert git_revision(installed) == "unknown"
     (code / "a.py").write_text("a = 2\n")
     assert git_revision(code) == f"{clean}-dirty"

@@ -1,0 +1,113 @@
+"""Dependencies: every import is declared for the part of the package that needs it; pins and ranges agree."""
+
+import ast
+import sys
+import tomllib
+from functools import cache
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import nbformat
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from support.paths import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DISTRIBUTIONS = packages_distributions()
+#: Each holds those before it.
+GROUPS = ("core", "scenes", "workbook", "dev")
+#: module or room of zerobev -> group; all others are core.
+GROUP_OF = {
+    **dict.fromkeys(["common.parallel", "scenes", "rendering", "data", "evaluation"], "scenes"),
+    **dict.fromkeys(["training", "experiments", "benchmarks", "report"], "workbook"),
+}
+#: Commands and plug-ins, which no module imports.
+TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "setuptools"}
+
+
+def requirements(group: str) -> dict[str, Requirement]:
+    """Name -> requirement of a group, without those of the groups it holds."""
+    lines = PROJECT["dependencies"] if group == "core" else PROJECT["optional-dependencies"][group]
+    found = {canonicalize_name(Requirement(line).name): Requirement(line) for line in lines}
+    found.pop("zerobev", None)
+    return found
+
+
+def declared(group: str) -> set[str]:
+    """Names that an installation with a group has."""
+    return {name for one in GROUPS[: GROUPS.index(group) + 1] for name in requirements(one)}
+
+
+def imported(source: str) -> set[str]:
+    """Full names of all modules that `source` imports, within functions too; of `from a import b` both a and a.b."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def distributions(names: set[str]) -> set[str]:
+    """The distributions of imported modules, but for the standard library, zerobev and the tests' own."""
+    roots = {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"zerobev", "support"}
+    return {canonicalize_name(DISTRIBUTIONS[root][0]) for root in roots}
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_of(path): imported(path.read_text()) for path in sorted((ROOT / "zerobev").rglob("*.py"))}
+
+
+def group_of(module: str) -> str:
+    inside = module.partition(".")[2]
+    return GROUP_OF.get(inside) or GROUP_OF.get(inside.partition(".")[0], "core")
+
+
+@cache
+def needed(module: str) -> frozenset[str]:
+    """The modules of zerobev that are loaded with `module`, parents and itself included."""
+    loaded, waiting = set(), [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in loaded and name in MODULES:
+            loaded.add(name)
+            waiting += [name.rpartition(".")[0], *MODULES[name]]
+    return frozenset(loaded)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_what_a_module_needs_is_declared(module: str):
+    names = {name for one in needed(module) for name in MODULES[one]}
+    assert distributions(names) <= declared(group_of(module))
+
+
+def test_what_tests_and_notebooks_import_is_declared():
+    tests = {name for path in (ROOT / "tests").rglob("*.py") for name in imported(path.read_text())}
+    assert distributions(tests) <= declared("dev")
+    cells = [cell for path in (ROOT / "notebooks").glob("*.ipynb") for cell in nbformat.read(path, as_version=4).cells]
+    code = {name for cell in cells if cell.cell_type == "code" for name in imported(cell.source)}
+    assert distributions(code) <= declared("workbook")
+
+
+@pytest.mark.parametrize("group", GROUPS[:-1])
+def test_what_is_declared_is_used(group: str):
+    used = {name for module, names in MODULES.items() if group_of(module) == group for name in names}
+    assert set(requirements(group)) - TOOLS <= distributions(used)
+
+
+def test_pins_and_ranges_agree():
+    lines = (line.partition("#")[0].strip() for line in (ROOT / "environment.txt").read_text().splitlines())
+    pins = {canonicalize_name(Requirement(line).name): Requirement(line) for line in lines if line}
+    ranges = {name: one for group in GROUPS for name, one in requirements(group).items()}
+    assert set(pins) == set(ranges)
+    for name, pin in pins.items():
+        (exact,) = pin.specifier
+        assert exact.operator == "==" and exact.version in ranges[name].specifier, pin
+        assert pin.extras == ranges[name].extras, pin
