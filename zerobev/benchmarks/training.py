@@ -173,7 +173,7 @@ def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str
     stream, step = _stream(setting), training_step(net, batch, machine)
     numbers = itertools.count()
     drawing = {"batch": lambda: stream.batch(next(numbers))}
-    measured = _against_the_machine({"step": step} | blocks(net, batch, machine), drawing, machine, repeats)
+    measured = against_the_machine({"step": step} | blocks(net, batch, machine), drawing, machine, repeats)
     waiting = {str(workers): waiting_share(net, stream, machine, workers) for workers in (0, 1)}
     return measured | {"waiting_share": waiting}
 
@@ -190,7 +190,7 @@ def measure_paper_step(machine: Machine, repeats: int) -> dict[str, Any]:
         "step": partial(_with_dropout, step, net, 0.0),
         "with dropout": partial(_with_dropout, step, net, paper.model.dropout),
     }
-    return _against_the_machine(steps, {}, machine, repeats)
+    return against_the_machine(steps, {}, machine, repeats)
 
 
 def _with_dropout(step: Run, net: BevModel, probability: float) -> None:
@@ -200,9 +200,7 @@ def _with_dropout(step: Run, net: BevModel, probability: float) -> None:
     step()
 
 
-def _against_the_machine(
-    runs: dict[str, Run], others: dict[str, Run], machine: Machine, repeats: int
-) -> dict[str, Any]:
+def against_the_machine(runs: dict[str, Run], others: dict[str, Run], machine: Machine, repeats: int) -> dict[str, Any]:
     """Time of runs and others, in turns with a matrix product and a copy, and what the runs reach of these two."""
     matrix = torch.rand(_MATMUL, _MATMUL, device=machine.device)
     matrix = matrix.bfloat16() if machine.bfloat16 else matrix
