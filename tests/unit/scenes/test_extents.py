@@ -59,7 +59,7 @@ def test_a_stray_vertex_is_named():
 
 
 def test_other_sizes():
-    with pytest.raises(InputError, match="at least 1 m in extent, found 0.005 x 0.004 x 0.0025"):
+    with pytest.raises(InputError, match=r"at least 1 m in extent, found 0\.005 x 0\.004 x 0\.0025"):
         check_extents(turned(HOME, 1e-3 * np.eye(3)), *FILES)
     with pytest.raises(InputError, match=r"^a\.glb: expected a photograph of .* 5 x 4 x 2.5, found 500 x 400 x 250"):
         check_extents(replace(HOME, photograph=turned(HOME, 100 * np.eye(3)).photograph), *FILES)
