@@ -108,7 +108,7 @@ def build(things: Iterable[Thing], name: str = "test", double_sided: bool = Fals
         instances=instances,
         photograph=_photograph(vertices, faces, uv.reshape(-1, 2), face_chart, images),
         unlit=True,
-        double_sided=np.full(len(faces), double_sided),
+        double_sided=double_sided,
     )
 
 

@@ -94,7 +94,7 @@ class _Geometry:
         self._mesh = TriangleMesh(self._embree, scene.vertices.astype(np.float32), scene.faces[keep].astype(np.int32))
         corner = scene.vertices[scene.faces[keep]]
         self._normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        self._double_sided = scene.double_sided[keep]
+        self._double_sided = np.broadcast_to(scene.double_sided, len(scene.faces))[keep]
         self._owner = scene.face_instance[keep]
         # one look-up serves the hits on all charts; what comes last is nothing
         self._instance = np.concatenate([*(image.ravel() for image in scene.chart_instance), [np.uint16(0)]])

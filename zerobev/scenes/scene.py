@@ -42,7 +42,7 @@ class Scene:
     instances: tuple[Instance, ...]  #: sorted by id
     photograph: trimesh.Scene  #: the textured mesh that photographs are taken of
     unlit: bool  #: light is part of the photograph's textures already
-    double_sided: np.ndarray  #: (F,) bool: the back of a face is visible too
+    double_sided: bool | np.ndarray  #: whether the back of a face is visible too: of all faces, or (F,) bool
 
     @property
     def generated(self) -> bool:

@@ -110,7 +110,7 @@ def test_culled_faces_are_passed_one_after_the_other():
     seen = RayCaster(scene).fpv(Pose(-1, 1, 0, 0), CAMERA)
     assert seen.instance[26, 24] == 7 and seen.distance[26, 24] == pytest.approx(1.5, abs=1e-4)
     assert seen.instance[20, 24] == 6 and seen.distance[20, 24] == pytest.approx(3, abs=1e-4)
-    seen = RayCaster(replace(scene, double_sided=np.ones(len(scene.faces), bool))).fpv(Pose(-1, 1, 0, 0), CAMERA)
+    seen = RayCaster(replace(scene, double_sided=True)).fpv(Pose(-1, 1, 0, 0), CAMERA)
     assert seen.instance[26, 24] == 5 and seen.distance[26, 24] == pytest.approx(1, abs=1e-4)
 
 

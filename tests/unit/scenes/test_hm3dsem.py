@@ -592,7 +592,6 @@ def refined(scene: Scene, cuts: int) -> Scene:
         faces=faces.reshape(-1, 3).astype(np.int32),
         face_uv=uv[:, small].reshape(-1, 3, 2),
         face_chart=np.repeat(scene.face_chart, len(small)),
-        double_sided=np.repeat(scene.double_sided, len(small)),
         photograph=photograph,
     )
 

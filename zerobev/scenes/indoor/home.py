@@ -96,7 +96,7 @@ def generate_home(name: str, rng: np.random.Generator) -> Scene:
         instances=home.instances,
         photograph=_photograph(atlas, vertices, faces, face_chart, textures),
         unlit=True,
-        double_sided=np.zeros(len(faces), bool),
+        double_sided=False,
     )
 
 
