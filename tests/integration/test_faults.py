@@ -17,13 +17,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from zerobev.common.errors import InputError
+from zerobev.common.errors import InputError, run_command
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, AgentConfig, CameraConfig, TextureConfig, TrainConfig
+from zerobev.data import generate as generation
 from zerobev.data.generate import generate, verify
 from zerobev.data.shards import write_shard
 from zerobev.data.textures import TextureBank
 from zerobev.data.views import View, ViewSource
+from zerobev.evaluation import real_homes
 from zerobev.evaluation.metrics import Counts
 from zerobev.experiments.run_records import RunStore
 from zerobev.models import build as build_network
@@ -266,6 +268,12 @@ def _with_nan(scene: Scene) -> Scene:
     return replace(scene, vertices=vertices)
 
 
+def _times(scene: Scene, factor: float) -> Scene:
+    photograph = scene.photograph.copy()
+    photograph.apply_scale(factor)
+    return replace(scene, vertices=scene.vertices * np.float32(factor), photograph=photograph)
+
+
 def _cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
@@ -282,6 +290,7 @@ def test_homes_that_are_none_are_skipped_and_named(tmp_path: Path) -> None:
         "00003-Flat": (_flattened(good), None, "class floor, found none"),
         "00004-NaN": (_with_nan(good), None, r"semantic\.glb: expected finite vertices"),
         "00005-Tiny": (build(room((0.4, 0.4, 2.5))), None, "of free floor, found none"),
+        "00009-Cm": (_times(good, 100), None, "expected a home in metres, .* likely in centimetres"),
         "00006-Cut": (good, ("Cut.glb", _cut), r"Cut\.glb: expected \d+ bytes"),
         "00007-Image": (good, ("Image.semantic.glb", _spoil_images), r"semantic\.glb: expected a readable PNG"),
         "00008-Gone": (good, ("Gone.semantic.txt", Path.unlink), r"semantic\.txt: .*No such file"),
@@ -299,6 +308,34 @@ def test_homes_that_are_none_are_skipped_and_named(tmp_path: Path) -> None:
         assert "\n" not in message
     assert list(json.loads((out / "manifest.json").read_text())["shards"]) == ["00001-Good.h5"]
     assert verify(out) == [] and [path.name for path in out.glob("*.h5")] == ["00001-Good.h5"]
+
+
+@pytest.mark.parametrize("error", [IndexError("index 9"), MemoryError("10 GiB")])
+def test_any_failure_of_a_home_is_its_own(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def read(folder: Path) -> Scene:
+        if folder.name == "00002-Bad":
+            raise error
+        return read_scene(folder)
+
+    for name in ("train/00001-Good", "train/00002-Bad", "minival/00800-Good", "val/00901-Good"):
+        write_scene(tmp_path / "homes" / name, build(furnished()))
+    cause = f"00002-Bad: {type(error).__name__}: {error}"
+    monkeypatch.setattr(generation, "read_scene", read)
+    monkeypatch.setattr(real_homes, "read_scene", read)
+    commands = {
+        generation.main: ["--scale", "smoke", "--views", "1", "--out", str(tmp_path / "out")],
+        real_homes.main: ["--views", "1", "--json", str(tmp_path / "found.json")],
+    }
+    for main, options in commands.items():
+        monkeypatch.setattr(sys, "argv", ["command", "--scenes", str(tmp_path / "homes"), *options])
+        with pytest.raises(SystemExit) as ended:
+            run_command(main)
+        assert ended.value.code == f"skipped {cause}"
+    assert {path.name for path in tmp_path.glob("out/*/*.h5")} == {f"{n}-Good.h5" for n in ("00001", "00800", "00901")}
+    assert json.loads((tmp_path / "found.json").read_text())["scenes"] == ["00001-Good", "00800-Good", "00901-Good"]
+    assert "3 homes, 1 views each" in capsys.readouterr().out
 
 
 def test_triangles_without_area_change_nothing(scene: Scene) -> None:

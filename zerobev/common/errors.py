@@ -3,10 +3,35 @@
 import errno
 import sys
 from collections.abc import Callable
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 class InputError(ValueError):
     """Bad input from the user: the message names the file or argument, what was expected and what was found."""
+
+
+class SetupError(InputError):
+    """The machine lacks something that every input needs, so that the next input would fail as well."""
+
+
+def attempt(work: Callable[[], T]) -> T | InputError:
+    """The result of `work` on one input of many, or its failure, whatever it is, as an `InputError` of one line.
+
+    Raised are only errors that every other input would meet, `SetupError` and a full disk, and what is no
+    `Exception`, such as `KeyboardInterrupt`.
+    """
+    try:
+        return work()
+    except SetupError:
+        raise
+    except InputError as error:
+        return InputError(str(error))  # without the traceback, which would keep the input in memory
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            raise
+        return InputError(" ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":"))
 
 
 def run_command(main: Callable[[], None]) -> None:

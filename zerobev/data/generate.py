@@ -18,7 +18,7 @@ from typing import Any
 import joblib
 import numpy as np
 
-from zerobev.common.errors import InputError
+from zerobev.common.errors import InputError, attempt
 from zerobev.common.keys import matches, plain
 from zerobev.common.parallel import cluster, run_jobs
 from zerobev.common.progress import progress
@@ -70,9 +70,9 @@ def generate(
     """Record every scene into `out` and write `manifest.json` there: configuration, seeds, SHA-256 of each shard.
 
     `workers` is a number of processes; under `joblib.parallel_config` with another back end, that one decides. A
-    broken scene is skipped; a shard of another run, or one that is not what the manifest lists, is left alone.
-    Returns what was wrong, scene name -> message; empty when all went well. Raises `InputError` where `out` has a
-    manifest of another run.
+    scene that fails, for whatever reason, is skipped; a shard of another run, or one that is not what the manifest
+    lists, is left alone. Returns the failures, scene name -> message; empty when all went well. Raises `InputError`
+    where `out` has a manifest of another run.
     """
     run = {**recorded_with(camera, texture), "seed": seed, "views": views}
     listed = _listed(out, run)
@@ -105,14 +105,16 @@ def _attempt(
     seed: int,
     listed: str | None,
 ) -> str | InputError:
-    """SHA-256 of the scene's shard (`listed`, if that is given), recorded now if need be, or what is wrong with it."""
-    try:
+    """SHA-256 of the scene's shard (`listed`, if that is given), recorded now if need be, or its failure."""
+
+    def record() -> str:
         path = generate_shard(folder, out, views, camera, texture, seed)
         if listed:
             _check_sum(path, listed)
         return checksum(path)
-    except InputError as error:
-        return error
+
+    try:
+        return attempt(record)
     finally:
         # meshes refer to themselves: without this they pile up until joblib takes the worker's memory for a leak
         gc.collect()

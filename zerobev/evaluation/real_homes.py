@@ -8,6 +8,7 @@ with true depth (a.1) and with estimated depth (a.2), and the networks that ship
 import argparse
 import sys
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from zerobev.common.errors import InputError
+from zerobev.common.errors import InputError, attempt
 from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
 from zerobev.config import LABELS, CameraConfig, TextureConfig
@@ -48,8 +49,8 @@ def render_views(folder: Path, number: int, views: int, camera: CameraConfig, se
 def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict[str, Counts], dict[str, str]]:
     """Intersections and unions of every row of `METHODS` on `views` views of each scene.
 
-    Returns the counts, and what was wrong with scenes that could not be read or rendered, name -> message: these
-    count nothing. Raises `InputError` where that is all of them.
+    Returns the counts, and the failures of scenes, for whatever reason, name -> message: these scenes count nothing.
+    Raises `InputError` where every scene fails.
     """
     if views < 1:
         raise InputError(f"views: expected 1 or more, found {views}")
@@ -59,16 +60,20 @@ def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict
     methods |= {row: projector.predict for row, projector in projectors.items()}
     total = {row: Counts.empty(len(folders), len(LABELS)) for row in METHODS}
     broken: dict[str, str] = {}
+
+    def home_counts(number: int, folder: Path) -> dict[str, Counts]:
+        batch = render_views(folder, number, views, camera, seed)
+        return {row: evaluate(predict, [batch], len(folders), len(LABELS)) for row, predict in methods.items()}
+
     for number, folder in enumerate(progress(folders, "homes", "home", len(folders))):
-        try:
-            batch = render_views(folder, number, views, camera, seed)
-        except InputError as error:
-            broken[folder.name] = str(error)
+        found = attempt(partial(home_counts, number, folder))
+        if isinstance(found, InputError):
+            broken[folder.name] = str(found)
             continue
-        for row, predict in methods.items():
-            total[row] += evaluate(predict, [batch], len(folders), len(LABELS))
+        for row, one in found.items():
+            total[row] += one
     if len(broken) == len(folders):
-        raise InputError("; ".join(broken.values()))
+        raise InputError("; ".join(f"{name}: {message}" for name, message in broken.items()))
     good = [number for number, folder in enumerate(folders) if folder.name not in broken]
     return {row: Counts(c.intersection[good], c.union[good]) for row, c in total.items()}, broken
 

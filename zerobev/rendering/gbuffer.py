@@ -5,6 +5,7 @@ makes a new texture for every sample cheap (paper, Section 3.2, "Data generation
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,50 +14,71 @@ from embreex.rtcore_scene import EmbreeScene
 
 from zerobev.config import CameraConfig
 from zerobev.geometry.cameras import Pose, bev_cell_centres, fpv_rays
+from zerobev.scenes.categories import is_ceiling
 from zerobev.scenes.scene import Scene
 
-_STEP_M = 1e-4  # behind a culled face the ray starts again this much farther
+#: One per ray: index of the face (-1: none), barycentric u and v, distance; all that can be written to.
+Hits = tuple[np.ndarray, ...]
+
+_STEP_M = 1e-4  # behind a face that is passed the ray starts again this much farther
+_EDGE_M = 1e-3  # the map begins this much below `max_height_m`: an underside at just that height is above it
+_BESIDE_M = 1.0  # the sides of a body without a bottom are this near, at most; under a roof there is more room
 
 
 @dataclass(frozen=True)
 class GBuffer:
-    """What each ray of a sensor met."""
+    """The surface that each ray of a sensor meets first."""
 
-    texel: np.ndarray  #: (H, W, 3) int16: chart, row, column; chart -1 where nothing was met
-    atlas: (
-        np.ndarray
-    )  #: (H, W) int64: the texel's index in all charts laid end to end; their size where nothing was met
-    instance: np.ndarray  #: (H, W) uint16 instance id, 0 where nothing was met
+    texel: np.ndarray  #: (H, W, 3) int16: chart, row, column; chart -1 where the ray meets nothing
+    atlas: np.ndarray  #: (H, W) int64: the texel's index in all charts laid end to end; their size for nothing
+    instance: np.ndarray  #: (H, W) uint16 instance id, 0 for nothing
     distance: np.ndarray  #: (H, W) float32, metres: planar depth (FPV) or height above the floor (BEV); 0 for nothing
 
 
 class RayCaster:
-    """Casts the rays of both sensors into a scene. Back faces are passed through unless the scene is double-sided."""
+    """Casts the rays of both sensors into a scene. The backs of faces that are not double-sided are passed through.
+
+    The map is a cut through the home, `max_height_m` above the floor that the camera stands on; inverse projection
+    leaves out the points above the same height. A cell shows the first surface below the cut. What hangs above the
+    cut, a ceiling, a lamp or another storey, does not count, whatever its name, and whichever way its faces look.
+    Where the cut goes through a body, a wall or a tall wardrobe, the cell shows the top of the body, and its height
+    is that of the top. A point is inside a body where the next face below looks down, or where the next face above
+    looks up and sides of that instance are near. Ceilings by name (`is_ceiling`) are left out at any height, so that
+    a low one does not hide the floor.
+
+    In generated homes the map is seen by a camera `bev_above_m` above the pinhole, as in the paper: their ceilings
+    look down, and nothing is above these. Their lamps are therefore on the map; recorded data depends on it.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        ceiling = np.array([i.id for i in scene.instances if i.name.lower() == "ceiling"], np.uint16)
-        # seen from above, a ceiling would hide the home; a single-sided one is culled, a double-sided one is left out
-        below_ceiling = np.flatnonzero(~np.isin(scene.face_instance, ceiling))
+        ceilings = np.array([i.id for i in scene.instances if is_ceiling(i.name)], np.uint16)
         self._everything = _Geometry(scene, np.arange(len(scene.faces)))
-        self._below_ceiling = _Geometry(scene, below_ceiling)
+        self._below_ceiling = _Geometry(scene, np.flatnonzero(~np.isin(scene.face_instance, ceilings)))
 
     def fpv(self, pose: Pose, camera: CameraConfig) -> GBuffer:
-        """What the pinhole camera sees; `distance` is planar depth."""
+        """The pinhole camera's view; `distance` is planar depth."""
         directions = _camera_rays(camera) @ pose.world_R_camera.T.astype(np.float32)
         origins = np.broadcast_to(pose.centre(camera).astype(np.float32), directions.shape)
         return self._everything.cast(origins, directions)
 
     def bev(self, pose: Pose, camera: CameraConfig) -> GBuffer:
-        """What the orthographic camera above sees, ceilings left out; `distance` is the height above the floor."""
+        """The map's view; `distance` is the height above the floor."""
         right, forward = bev_cell_centres(camera)
-        start_m = camera.height_m + camera.bev_above_m
+        in_generated = camera.height_m + camera.bev_above_m
+        start_m = in_generated if self.scene.generated else camera.max_height_m - _EDGE_M
         local = np.stack([right, forward, np.full_like(right, start_m)], axis=-1)
         origins = (local @ pose.world_R_map.T + (pose.x, pose.y, pose.floor_z)).astype(np.float32)
-        down = np.broadcast_to(np.array([0, 0, -1], np.float32), origins.shape)
-        seen = self._below_ceiling.cast(origins, down)
+        seen = self._below_ceiling.cast_down(origins, cut=not self.scene.generated)
         height = np.where(seen.texel[..., 0] < 0, 0, start_m - seen.distance).astype(np.float32)
         return replace(seen, distance=height)
+
+
+def _along(points: np.ndarray, axis: int, sign: int) -> np.ndarray:
+    """(N, 3) float32 directions along an axis of the world, one per point."""
+    directions = np.zeros_like(points)
+    directions[:, axis] = sign
+    return directions
 
 
 @functools.lru_cache(maxsize=4)
@@ -72,7 +94,8 @@ class _Geometry:
         self._mesh = TriangleMesh(self._embree, scene.vertices.astype(np.float32), scene.faces[keep].astype(np.int32))
         corner = scene.vertices[scene.faces[keep]]
         self._normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        self._double_sided = scene.double_sided
+        self._double_sided = np.broadcast_to(scene.double_sided, len(scene.faces))[keep]
+        self._owner = scene.face_instance[keep]
         # one look-up serves the hits on all charts; what comes last is nothing
         self._instance = np.concatenate([*(image.ravel() for image in scene.chart_instance), [np.uint16(0)]])
         self._shape = np.array([image.shape for image in scene.chart_instance])
@@ -84,8 +107,54 @@ class _Geometry:
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> GBuffer:
         """Cast float32 rays of shape (H, W, 3); `distance` is in units of the length of the direction."""
-        shape = origins.shape[:-1]
-        face, u, v, distance = self._first_visible(origins.reshape(-1, 3), directions.reshape(-1, 3))
+        found = self._first_visible(origins.reshape(-1, 3), directions.reshape(-1, 3))
+        return self._look_up(found, origins.shape[:-1])
+
+    def cast_down(self, origins: np.ndarray, cut: bool) -> GBuffer:
+        """Cast rays straight down from float32 points of shape (H, W, 3).
+
+        With `cut`, rays that start in a body meet its top, at a distance below zero.
+        """
+        points = np.ascontiguousarray(origins.reshape(-1, 3))
+        found = self._first_visible(points, _along(points, 2, -1))
+        if cut:
+            self._put_tops(points, found)
+        return self._look_up(found, origins.shape[:-1])
+
+    def _put_tops(self, points: np.ndarray, found: Hits) -> None:
+        """Replace the hits of the points that lie in a body by the body's top, straight above."""
+        body = self._body(points)
+        place = np.flatnonzero(body >= 0)
+        inside, up = points[place], _along(points[place], 2, 1)
+
+        def is_not_top(face: np.ndarray, ray: np.ndarray) -> np.ndarray:
+            return ~(self._is_back(face, up[ray]) & (self._owner[face] == body[place[ray]]))
+
+        top = self._first_unpassed(inside, up, is_not_top)
+        place, top = place[top[0] >= 0], tuple(values[top[0] >= 0] for values in top)
+        for values, new in zip(found, (*top[:3], -top[3])):
+            values[place] = new
+
+    def _body(self, points: np.ndarray) -> np.ndarray:
+        """(N,) instance id of the body that each point (N, 3) lies in, -1 for none."""
+        down, up = _along(points, 2, -1), _along(points, 2, 1)
+        below, above = self._first(points, down)[0], self._first(points, up)[0]
+        body = np.where(self._is_back(below, down), self._owner[below].astype(int), -1)
+        # a body may have no bottom: what it stands on is the next face below
+        open_below = np.flatnonzero((body < 0) & self._is_back(above, up))
+        owner, start = self._owner[above[open_below]], points[open_below]
+        enclosed = np.zeros(len(open_below), bool)
+        for axis in (0, 1):
+            sides = [self._first(start, _along(start, axis, sign)) for sign in (-1, 1)]
+            near = [(face >= 0) & (distance < _BESIDE_M) for face, _, _, distance in sides]
+            own = [self._owner[face] == owner for face, *_ in sides]
+            enclosed |= near[0] & near[1] & (own[0] | own[1])
+        body[open_below] = np.where(enclosed, owner, -1)
+        return body
+
+    def _look_up(self, found: Hits, shape: tuple[int, ...]) -> GBuffer:
+        """The texels of hits, one per ray of an image of `shape`."""
+        face, u, v, distance = found
         texel = np.full((*shape, 3), -1, np.int16)
         atlas = np.full(shape, len(self._instance) - 1)
         hit = face >= 0
@@ -101,28 +170,40 @@ class _Geometry:
         atlas.reshape(-1)[place] = self._start.take(chart) + row * columns + column
         return GBuffer(texel, atlas, self._instance.take(atlas), np.where(hit, distance, 0).reshape(shape))
 
-    def _first_visible(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """First face met by each ray that is not culled: index (-1: none), barycentric u and v, distance."""
-        first = self._first(origins, directions)
-        if self._double_sided:
-            return first
-        face, _, _, distance = first
-        pending = np.flatnonzero(self._is_back(face, directions))
+    def _first_visible(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """First face met by each ray that is not culled."""
+        if self._double_sided.all():
+            return self._first(origins, directions)
+
+        def is_culled(face: np.ndarray, ray: np.ndarray) -> np.ndarray:
+            return self._is_back(face, directions[ray]) & ~self._double_sided[face]
+
+        return self._first_unpassed(origins, directions, is_culled)
+
+    def _first_unpassed(
+        self, origins: np.ndarray, directions: np.ndarray, is_passed: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    ) -> Hits:
+        """First face met by each ray that `is_passed(face, ray)` is false for; these are indices (N,) of both."""
+        found = self._first(origins, directions)
+        face, _, _, distance = found
+        pending = np.flatnonzero(face >= 0)
+        pending = pending[is_passed(face[pending], pending)]
         while pending.size:
             start = distance[pending] + np.float32(_STEP_M)
             again = origins[pending] + start[:, None] * directions[pending]
-            for values, found in zip(first, self._first(again, directions[pending])):
-                values[pending] = found
+            for values, new in zip(found, self._first(again, directions[pending])):
+                values[pending] = new
             distance[pending] += start
-            pending = pending[self._is_back(face[pending], directions[pending])]
-        return first
+            pending = pending[face[pending] >= 0]
+            pending = pending[is_passed(face[pending], pending)]
+        return found
 
     def _is_back(self, face: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Which of the faces met (-1: none) are seen from behind."""
         return (face >= 0) & (np.einsum("nd,nd->n", self._normal[face], directions) > 0)
 
-    def _first(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """First face met by each ray, front or back: index (-1: none), barycentric u and v, distance."""
+    def _first(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """First face met by each ray, front or back."""
         found = self._embree.run(
             np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="INTERSECT", output=True
         )

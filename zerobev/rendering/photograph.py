@@ -1,7 +1,5 @@
 """Photographs (RGB) of a scene, rasterised by pyrender through EGL: a GPU where there is one, else Mesa."""
 
-import atexit
-import functools
 from collections import defaultdict
 from dataclasses import dataclass
 
@@ -11,7 +9,7 @@ from PIL import Image
 
 from zerobev.config import CameraConfig
 from zerobev.geometry.cameras import Pose
-from zerobev.rendering.opengl import pyrender
+from zerobev.rendering.opengl import pyrender, renderer
 from zerobev.scenes.scene import Scene
 
 _SUPERSAMPLING = 2  # rendered this much larger and averaged: fine textures would flicker otherwise
@@ -22,8 +20,6 @@ _AMBIENT, _HEADLAMP = 0.35, 6.0  # light of scenes that bring none of their own
 _CAMERA_R_OPENGL = np.diag([1.0, -1.0, -1.0])
 _UV_SLACK = 1e-3  # texture coordinates of images that are not tiled may leave [0, 1] by rounding
 _ATLAS_PX = 8192  # side of the largest atlas of textures, unless one texture is larger
-# no mip maps: they would mix texels of neighbours in the atlas
-_LINEAR = pyrender.Sampler(magFilter=pyrender.GLTF.LINEAR, minFilter=pyrender.GLTF.LINEAR)
 
 
 class Photographer:
@@ -32,7 +28,7 @@ class Photographer:
     def __init__(self, scene: Scene, camera: CameraConfig) -> None:
         self._camera = camera
         self._flags = pyrender.RenderFlags.FLAT if scene.unlit else pyrender.RenderFlags.NONE
-        if scene.double_sided:
+        if np.any(scene.double_sided):
             self._flags |= pyrender.RenderFlags.SKIP_CULL_FACES
         self._scene = pyrender.Scene(ambient_light=[_AMBIENT] * 3, bg_color=[*_SKY, 1.0])
         self._scene.add(pyrender.Mesh(_primitives(scene.photograph)))
@@ -68,19 +64,11 @@ def world_T_opengl(pose: Pose, camera: CameraConfig) -> np.ndarray:
     return world_T_camera
 
 
-def render(scene: pyrender.Scene, flags: int, side_px: int) -> tuple[np.ndarray, np.ndarray]:
+def render(scene: "pyrender.Scene", flags: int, side_px: int) -> tuple[np.ndarray, np.ndarray]:
     """(S, S, 3) uint8 colours and (S, S) float32 depth of a scene, through the process's one GL context."""
-    renderer = _renderer()
-    renderer.viewport_width = renderer.viewport_height = side_px
-    return renderer.render(scene, flags)
-
-
-@functools.cache
-def _renderer() -> pyrender.OffscreenRenderer:
-    """The process's one renderer: closing one of several would take the display from the others."""
-    renderer = pyrender.OffscreenRenderer(1, 1)
-    atexit.register(renderer.delete)
-    return renderer
+    made = renderer()
+    made.viewport_width = made.viewport_height = side_px
+    return made.render(scene, flags)
 
 
 @dataclass(frozen=True)
@@ -98,7 +86,7 @@ class _Textured:
         return bool(self.uv.min() < -_UV_SLACK or self.uv.max() > 1 + _UV_SLACK)
 
 
-def _primitives(photograph: trimesh.Scene) -> list[pyrender.Primitive]:
+def _primitives(photograph: trimesh.Scene) -> "list[pyrender.Primitive]":
     """One primitive an atlas of textures, and one for all that is plain: a draw call costs more than its triangles."""
     plain: list[tuple[np.ndarray, np.ndarray]] = []
     groups: dict[tuple[bool, int], list[_Textured]] = defaultdict(list)
@@ -120,7 +108,7 @@ def _primitives(photograph: trimesh.Scene) -> list[pyrender.Primitive]:
     return primitives
 
 
-def _textured_primitives(parts: list[_Textured]) -> list[pyrender.Primitive]:
+def _textured_primitives(parts: list[_Textured]) -> "list[pyrender.Primitive]":
     """The primitives of surfaces of one kind, their images side by side in as few atlases as hold them."""
     # four bytes a texel: OpenGL takes rows of three only where they are a multiple of four long
     images = {id(part.image): np.asarray(part.image.convert("RGB").convert("RGBA")) for part in parts}
@@ -128,6 +116,8 @@ def _textured_primitives(parts: list[_Textured]) -> list[pyrender.Primitive]:
         # a frame of their own border keeps linear look-ups within an image
         images = {key: np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge") for key, image in images.items()}
     frame = int(len(images) > 1)
+    # no mip maps: they would mix texels of neighbours in the atlas
+    linear = pyrender.Sampler(magFilter=pyrender.GLTF.LINEAR, minFilter=pyrender.GLTF.LINEAR)
     primitives = []
     for places in _shelves({key: image.shape[:2] for key, image in images.items()}):
         rows, columns = (max(places[key][k] + images[key].shape[k] for key in places) for k in (0, 1))
@@ -139,7 +129,7 @@ def _textured_primitives(parts: list[_Textured]) -> list[pyrender.Primitive]:
         uv_px = [part.uv * part.image.size + np.add(places[id(part.image)], frame)[::-1] for part in here]
         uv = np.concatenate(uv_px) / (columns, rows) * (1, -1) + (0, 1)  # OpenGL's v runs up
         material = pyrender.MetallicRoughnessMaterial(
-            baseColorTexture=pyrender.Texture(source=atlas, source_channels="RGBA", sampler=_LINEAR),
+            baseColorTexture=pyrender.Texture(source=atlas, source_channels="RGBA", sampler=linear),
             metallicFactor=0.0,
             roughnessFactor=1.0,
             doubleSided=here[0].double_sided,

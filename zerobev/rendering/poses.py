@@ -38,7 +38,8 @@ class NavigableFloor:
 def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) -> NavigableFloor:
     """Rasterise the floor, take away what the agent's body would meet, and keep patches of a useful size.
 
-    Several storeys are handled one above the other. Raises `InputError` where no free floor is left.
+    Several storeys are handled one above the other; nobody stands where a floor ends or steps up or down by more than
+    `climb_m`. Raises `InputError` where no free floor is left.
     """
     corner = scene.vertices[scene.faces].astype(np.float64)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -59,7 +60,7 @@ def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) 
     cells = []
     for height in _storeys(scene, floor, low, shape, agent):
         above = obstacle_m - height.ravel().take(obstacle_cell)
-        free = np.isfinite(height)
+        free = np.isfinite(height) & ~_is_edge(height, agent.climb_m)
         free.ravel()[obstacle_cell[(above > agent.climb_m) & (above < agent.height_m)]] = False
         # the axis keeps the radius from everything that is not free, the border of the grid included
         room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * agent.grid_m > agent.radius_m
@@ -89,14 +90,15 @@ def _surface_samples(corner: np.ndarray, rng: np.random.Generator) -> tuple[np.n
 def _storeys(
     scene: Scene, floor: np.ndarray, low: np.ndarray, shape: tuple[int, int], agent: AgentConfig
 ) -> list[np.ndarray]:
-    """Floor height of each grid cell, one (I, J) array a storey from the lowest up; NaN where there is no floor.
+    """Floor height of each grid cell, one (I, J) array per storey from the lowest up; NaN where there is no floor.
 
-    Floors of one storey are no step higher than `climb_m` apart, so that a gallery ends at its edge.
+    Floors of one storey are no step higher than `climb_m` apart, so that a gallery ends at its edge. Where stairs of
+    the class floor join two storeys, one array has the upper floor of each cell, and the next one the lower floor.
     """
     embree = EmbreeScene()
     mesh = TriangleMesh(embree, scene.vertices.astype(np.float32), scene.faces[floor].astype(np.int32))
     i, j = np.indices(shape)
-    start = np.full(shape, scene.vertices[:, 2].max() + 1.0)
+    start = np.full(shape, scene.vertices[scene.faces, 2].max() + 1.0)  # of unused vertices any may be anywhere
     layers = []  # from the top down; one layer may be upper floor here and lower floor there
     while True:
         origins = np.stack([low[0] + (i + 0.5) * agent.grid_m, low[1] + (j + 0.5) * agent.grid_m, start], axis=-1)
@@ -114,4 +116,15 @@ def _storeys(
     heights = np.sort(np.concatenate([height[np.isfinite(height)] for height in layers]))
     lowest = heights[1:][np.diff(heights) > agent.climb_m]  # of each storey but the first
     storey = np.searchsorted(lowest, layers, side="right")
-    return [np.fmax.reduce(np.where(storey == k, layers, np.nan)) for k in range(len(lowest) + 1)]
+    of_storeys = [-np.sort(np.where(storey == k, np.negative(layers), np.nan), axis=0) for k in range(len(lowest) + 1)]
+    return [height for layer in of_storeys for height in layer if np.isfinite(height).any()]
+
+
+def _is_edge(height: np.ndarray, climb_m: float) -> np.ndarray:
+    """(I, J) bool: cells with a neighbour more than `climb_m` higher or lower."""
+    edge = np.zeros(height.shape, bool)
+    for axis in (0, 1):
+        step = np.abs(np.diff(height, axis=axis)) > climb_m
+        for side in ((1, 0), (0, 1)):
+            edge |= np.pad(step, [side if k == axis else (0, 0) for k in (0, 1)])
+    return edge

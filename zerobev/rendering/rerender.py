@@ -8,7 +8,6 @@ from zerobev.rendering.opengl import pyrender
 from zerobev.rendering.photograph import render, world_T_opengl
 from zerobev.scenes.scene import Scene
 
-_NEAREST = pyrender.Sampler(magFilter=pyrender.GLTF.NEAREST, minFilter=pyrender.GLTF.NEAREST)
 _NEAR_M, _FAR_M = 0.05, 100.0
 
 
@@ -34,9 +33,10 @@ class Rerenderer:
 
     def wear(self, texture: list[np.ndarray]) -> None:
         """Put a texture on the surfaces: a (rows, columns) bool image a chart."""
+        nearest = pyrender.Sampler(magFilter=pyrender.GLTF.NEAREST, minFilter=pyrender.GLTF.NEAREST)
         for primitive, white in zip(self._primitives, texture):
             source = np.repeat(np.where(white, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
-            image = pyrender.Texture(source=source, source_channels="RGB", sampler=_NEAREST)
+            image = pyrender.Texture(source=source, source_channels="RGB", sampler=nearest)
             primitive.material = pyrender.MetallicRoughnessMaterial(baseColorTexture=image)
 
     def fpv(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:

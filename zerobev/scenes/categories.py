@@ -1,4 +1,4 @@
-"""Object names of HM3DSem to the eight evaluated classes."""
+"""Object names of HM3DSem to the eight evaluated classes, and to ceilings."""
 
 import re
 
@@ -37,6 +37,11 @@ _NEITHER = (
     "decoratrive plant, dried flowers, led tv, wall tv"
 )
 
+#: A name that ends with one of these nouns is a ceiling, misspellings included.
+_CEILINGS = frozenset(["ceiling", "ceilling", "ceiiling", "ceiilng", "ceiliing", "celing", "cieling", "roof"])
+_CEILINGS_TOO = frozenset(("ceiling panel", "ceiling panels"))
+_NO_CEILING = "lamp ceiling"
+
 _LABEL_OF_NOUN = {noun: LABELS.index(label) for label, nouns in _NOUNS.items() for noun in nouns.split()}
 _LABEL_OF_NAME = {name: LABELS.index(label) for label, names in _ALSO.items() for name in names.split(", ")}
 _LABEL_OF_NAME |= dict.fromkeys(_NEITHER.split(", "), NO_LABEL)
@@ -54,11 +59,27 @@ def label_of(name: str) -> int:
     seats are not; rugs, carpets and most mats are floor; monitors and whiteboards are tv; bidets are toilets;
     baseboards are wall; "decorative plant" and vases are not plants, "plant" and "flowers" are.
     """
-    tidy = " ".join(name.lower().split())
+    tidy = _tidy(name)
     if tidy in _LABEL_OF_NAME:
         return _LABEL_OF_NAME[tidy]
-    tidy = re.sub(r"^unknown ?/ ?(probably )?", "", tidy)
-    tidy = tidy.split("/")[0].strip()
+    tidy = _without_notes(tidy)
     if tidy in _LABEL_OF_NAME:
         return _LABEL_OF_NAME[tidy]
     return _LABEL_OF_NOUN.get(tidy.rpartition(" ")[2], NO_LABEL)
+
+
+def is_ceiling(name: str) -> bool:
+    """Whether an object called `name` is a ceiling or a roof; the noun at its end decides, as in `label_of`.
+
+    So "kitchen ceiling" and "ceilling" are ceilings, "ceiling lamp" and "ceiling fan" are not.
+    """
+    tidy = _without_notes(_tidy(name))
+    return tidy in _CEILINGS_TOO or (tidy.rpartition(" ")[2] in _CEILINGS and tidy != _NO_CEILING)
+
+
+def _tidy(name: str) -> str:
+    return " ".join(name.lower().split())
+
+
+def _without_notes(tidy: str) -> str:
+    return re.sub(r"^unknown ?/ ?(probably )?", "", tidy).split("/")[0].strip()

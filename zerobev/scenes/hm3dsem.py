@@ -5,6 +5,7 @@ them, with `HASH.glb` (the photograph), `HASH.semantic.glb` (the annotation) and
 Variants with Basis textures are ignored. `hm3dsem_writer` writes the same.
 """
 
+import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +17,11 @@ from PIL import Image
 from zerobev.common.errors import InputError
 from zerobev.config import Split, one_of
 from zerobev.scenes.categories import label_of
+from zerobev.scenes.extents import check_extents
 from zerobev.scenes.glb import RAW_UV, placed_meshes, read_glb
 from zerobev.scenes.scene import Instance, Scene
+
+log = logging.getLogger("zerobev.scenes")
 
 FIRST_LINE = "HM3D Semantic Annotations"
 _SPLITS = ("train", "val", "minival")
@@ -25,6 +29,7 @@ _MINIVAL = ("00800", "00802", "00803", "00808")
 _ROW = re.compile(r'([0-9]{1,5}),([0-9A-Fa-f]{6}),"(.*)",(-?[0-9]{1,9})')
 _ROW_FORM = 'id,RRGGBB,"name",region'
 _LARGEST_ID = 65535
+_ROWS_SHOWN = 5  # of the bad rows of a file
 _LARGEST_SIDE = 32767  # of a texture: texels are kept as int16
 
 
@@ -98,14 +103,14 @@ def read_scene(folder: Path) -> Scene:
 
     Faces keep the file's order; charts are in the order of their first face. Texels whose colour belongs to no
     instance get id 0. UV coordinates are clamped to [0, 1]. A mesh of the annotation without a texture is an
-    `InputError` (textures for the surface need the atlas), and so is every broken or missing file.
+    `InputError` (textures for the surface need the atlas), and so is every broken or missing file, and a home that is
+    not in metres with z up (`check_extents`).
     """
     folder = Path(folder)
     stem = hash_of(folder)
     instances = read_instances(folder / f"{stem}.semantic.txt")
     path = folder / f"{stem}.semantic.glb"
-    header, annotation = read_glb(path)
-    double_sided = any(material.get("doubleSided", False) for material in header.get("materials", []))
+    _, annotation = read_glb(path)
     atlas = _read_atlas(path, annotation, instances)
     photograph_path = folder / f"{stem}.glb"
     photograph_header, photograph = read_glb(photograph_path)
@@ -114,45 +119,63 @@ def read_scene(folder: Path) -> Scene:
         image = _texture(mesh)
         if image is not None:
             _decode(photograph_path, image)
-    return Scene(
-        name=folder.name, **atlas, instances=instances, photograph=photograph, unlit=unlit, double_sided=double_sided
-    )
+    scene = Scene(name=folder.name, **atlas, instances=instances, photograph=photograph, unlit=unlit)
+    check_extents(scene, path, photograph_path)
+    return scene
 
 
 def read_instances(path: Path) -> tuple[Instance, ...]:
     """The rows of a `.semantic.txt`, sorted by id, with the labels of their names.
 
     The form is a first line `HM3D Semantic Annotations`, then `id,RRGGBB,"name",region` in each line; a name may
-    hold commas and quotes. Ids are 1 to 65535; ids and colours are unique, and black is "unknown". All else is
-    an `InputError` with the file, the line and what stands there.
+    hold commas and quotes. Ids are 1 to 65535; ids and colours are unique, and black is "unknown".
+
+    A row of another form, or with the id of an earlier row, is left out, and two rows of one colour are left out both:
+    their surface has id 0, "unknown". One warning on the log "zerobev.scenes" lists them. A file without a good row,
+    without the first line, or that cannot be read, is an `InputError`.
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
+        lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
     except OSError as error:
         raise InputError(f"{path}: expected a list of instances, found {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected UTF-8 text, found byte {error.object[error.start]:#04x}") from error
     if lines[0].rstrip() != FIRST_LINE:
         raise InputError(f"{path}, line 1: expected {FIRST_LINE!r}, found {lines[0][:80]!r}")
     instances: dict[int, Instance] = {}
-    colors = {(0, 0, 0)}
+    id_of_color: dict[tuple[int, int, int], int] = {(0, 0, 0): 0}
+    bad = []
     for number, line in enumerate(lines[1:], start=2):
         row = line.strip()
         if not row:
             continue
-        match = _ROW.fullmatch(row)
-        if match is None or not 1 <= int(match[1]) <= _LARGEST_ID:
-            expected = f"{_ROW_FORM} with an id from 1 to {_LARGEST_ID}"
-            raise InputError(f"{path}, line {number}: expected {expected}, found {row[:80]!r}")
-        red, green, blue = bytes.fromhex(match[2])
-        color = red, green, blue
-        instance = Instance(int(match[1]), color, match[3], int(match[4]), label_of(match[3]))
-        if instance.id in instances or color in colors:
-            raise InputError(f"{path}, line {number}: expected an id and a color not used before, found {row[:80]!r}")
-        colors.add(color)
+        instance = _instance(row)
+        if instance is not None and instances.get(instance.id) == instance:
+            continue  # the row of before, once more
+        if instance is None or instance.id in instances or instance.color in id_of_color:
+            bad.append(f"line {number}, {row.encode(errors='backslashreplace').decode()[:80]!r}")
+            if instance is not None:
+                instances.pop(id_of_color.get(instance.color, 0), None)
+            continue
+        id_of_color[instance.color] = instance.id
         instances[instance.id] = instance
+    if bad:
+        expected = f"{_ROW_FORM} with UTF-8, an id from 1 to {_LARGEST_ID}, and ids and colors not used twice"
+        more = f" and {len(bad) - _ROWS_SHOWN} more" if len(bad) > _ROWS_SHOWN else ""
+        message = f"{path}: expected {expected}, found {'; '.join(bad[:_ROWS_SHOWN])}{more}"
+        if not instances:
+            raise InputError(message)
+        log.warning("%s: their surfaces are unknown", message)
     return tuple(instances[key] for key in sorted(instances))
+
+
+def _instance(row: str) -> Instance | None:
+    """The instance of one row of a `.semantic.txt`, or None for a row of another form."""
+    match = _ROW.fullmatch(row)
+    is_utf8 = not any("\ud800" <= character <= "\udfff" for character in row)
+    if match is None or not is_utf8 or not 1 <= int(match[1]) <= _LARGEST_ID:
+        return None
+    red, green, blue = bytes.fromhex(match[2])
+    return Instance(int(match[1]), (red, green, blue), match[3], int(match[4]), label_of(match[3]))
 
 
 def _is_annotated(folder: Path) -> bool:
@@ -166,7 +189,7 @@ def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance
     for instance in instances:
         red, green, blue = instance.color
         id_of_color[red | green << 8 | blue << 16] = instance.id
-    vertices, faces, face_uv, face_chart = [], [], [], []
+    vertices, faces, face_uv, face_chart, double_sided = [], [], [], [], []
     charts: list[np.ndarray] = []
     chart_of_image: dict[int, int] = {}
     count = 0
@@ -189,6 +212,7 @@ def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance
         faces.append((triangles + count).astype(np.int32))
         face_uv.append(np.clip(uv, 0, 1).astype(np.float32)[triangles])
         face_chart.append(np.full(len(triangles), chart_of_image[id(image)], np.int16))
+        double_sided.append(np.full(len(triangles), bool(mesh.visual.material.doubleSided)))
         count += len(positions)
     return {
         "vertices": np.concatenate(vertices),
@@ -196,6 +220,7 @@ def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance
         "face_uv": np.concatenate(face_uv),
         "face_chart": np.concatenate(face_chart),
         "chart_instance": tuple(charts),
+        "double_sided": np.concatenate(double_sided),
     }
 
 

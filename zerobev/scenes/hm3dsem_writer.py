@@ -26,10 +26,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
     Annotation colours are kept twice, as HM3DSem does: as raw sRGB bytes in the texture, and as linear vertex
     colours. The annotation is lossless (PNG); the photograph's textures are JPEG, those with transparency PNG.
-    What `read_scene` gives back has the faces grouped by chart, in their order within it; vertices appear once
-    for every chart, UV coordinate and instance that they are used with, in their order, and unused ones not at
-    all; charts without a face are left out. A scene in that form already comes back as it was, bit for bit, apart
-    from the compression of the photograph.
+    What `read_scene` gives back has the faces grouped by chart, and by sidedness within it, in their order; vertices
+    appear once for every chart, UV coordinate and instance that they are used with, in their order, and unused ones
+    not at all; charts without a face are left out. A scene in that form already comes back as it was, bit for bit,
+    apart from the compression of the photograph.
 
     The folder appears whole or not at all, and replaces an earlier scene of the same files. A folder with other
     files in it is an `InputError`, and so are a bad folder name and an instance name that is no single line.
@@ -82,28 +82,30 @@ def _row(instance: Instance) -> str:
 
 
 def _annotation_primitives(scene: Scene) -> Iterator[Primitive]:
-    """One primitive a chart."""
+    """One primitive per chart, or two that share the chart's image where a part of its faces is double-sided."""
     colors = np.zeros((len(scene.instance_label), 3), np.uint8)
     for instance in scene.instances:
         colors[instance.id] = instance.color
     linear = np.concatenate([srgb_to_linear(colors), np.full((len(colors), 1), 65535, np.uint16)], axis=1)
     for chart, image in enumerate(scene.chart_instance):
-        on = scene.face_chart == chart
-        if not on.any():
-            continue
-        corner_uv = np.ascontiguousarray(scene.face_uv[on], np.float32).reshape(-1, 2)
-        ids = np.repeat(scene.face_instance[on], 3)
-        first, faces = _shared_corners(scene.faces[on].reshape(-1), corner_uv, ids)
-        yield Primitive(
-            name=f"chunk{chart:03d}",
-            positions=scene.vertices[scene.faces[on].reshape(-1)[first]],
-            faces=faces,
-            uv=corner_uv[first],
-            colors=linear[ids[first]],
-            image=_encoded(Image.fromarray(np.take(colors, image, axis=0)), "PNG", compress_level=1),
-            unlit=True,
-            double_sided=scene.double_sided,
-        )
+        encoded = _encoded(Image.fromarray(np.take(colors, image, axis=0)), "PNG", compress_level=1)
+        for sided in (False, True):
+            on = (scene.face_chart == chart) & (scene.double_sided == sided)
+            if not on.any():
+                continue
+            corner_uv = np.ascontiguousarray(scene.face_uv[on], np.float32).reshape(-1, 2)
+            ids = np.repeat(scene.face_instance[on], 3)
+            first, faces = _shared_corners(scene.faces[on].reshape(-1), corner_uv, ids)
+            yield Primitive(
+                name=f"chunk{chart:03d}",
+                positions=scene.vertices[scene.faces[on].reshape(-1)[first]],
+                faces=faces,
+                uv=corner_uv[first],
+                colors=linear[ids[first]],
+                image=encoded,
+                unlit=True,
+                double_sided=sided,
+            )
 
 
 def _shared_corners(vertex: np.ndarray, uv: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,7 +126,7 @@ def _photograph_primitives(scene: Scene) -> Iterator[Primitive]:
     """One primitive a mesh, placed in the world."""
     encoded: dict[int, bytes] = {}
     for index, (mesh, positions, faces) in enumerate(placed_meshes(scene.photograph)):
-        uv, colors, image, double_sided = None, None, None, scene.double_sided
+        uv, colors, image, double_sided = None, None, None, bool(np.any(scene.double_sided))
         factor: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
         if mesh.visual.kind == "texture":
             material = mesh.visual.material

@@ -1,5 +1,6 @@
 """A scene: what the sensors need to know about a home, in memory."""
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -41,7 +42,12 @@ class Scene:
     instances: tuple[Instance, ...]  #: sorted by id
     photograph: trimesh.Scene  #: the textured mesh that photographs are taken of
     unlit: bool  #: light is part of the photograph's textures already
-    double_sided: bool  #: back faces are visible too
+    double_sided: bool | np.ndarray  #: whether the back of a face is visible too: of all faces, or (F,) bool
+
+    @property
+    def generated(self) -> bool:
+        """Whether this is one of the homes of `zerobev.scenes.homes`, which alone have such names."""
+        return re.fullmatch(r"([0-9]{5}-)?Home[0-9]{7}", self.name) is not None
 
     @cached_property
     def instance_label(self) -> np.ndarray:

@@ -104,22 +104,6 @@ def test_height_is_above_the_floor_of_the_pose():
     assert seen.distance[seen.instance == FLOOR] == pytest.approx(0, abs=1e-5)
 
 
-def test_ceilings_from_above_and_from_below():
-    """One-sided: passed from above whatever its name, met from below. Two-sided: left out of the map by name."""
-    pose = POSES[0]
-    for name, double_sided, in_map in [
-        ("roof", False, FLOOR),
-        ("roof", True, CEILING),
-        ("Ceiling", True, FLOOR),
-        ("ceiling", False, FLOOR),
-    ]:
-        caster = RayCaster(build(room(SIZE, ceiling=name), double_sided=double_sided))
-        inside = world_cells(pose, CAMERA, np.zeros((50, 50)))
-        inside = ((inside[..., :2] > 0.01) & (inside[..., :2] < SIZE[:2] - 0.01)).all(axis=-1)
-        assert (caster.bev(pose, CAMERA).instance[inside] == in_map).all()
-        assert (caster.fpv(pose, CAMERA).instance[0] == CEILING).any()
-
-
 def test_culled_faces_are_passed_one_after_the_other():
     """From outside, through two rooms' backs: a wall is seen only where it faces the camera."""
     scene = build([*room((2, 2, 2.5)), box("chest", (0.5, 0.5, 0), (1.5, 1.5, 1))])

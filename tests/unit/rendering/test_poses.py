@@ -1,5 +1,6 @@
 """Navigable floor of hand-made rooms, of which the free area is known."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -91,6 +92,30 @@ def test_nobody_stands_on_the_edge_of_a_gallery():
     # below it the floor goes on, without a seam at its edge
     under = NavigableFloor(below, AGENT.grid_m)
     assert all(is_free(under, x, 2) for x in (2.9, 3, 3.1, 4.5))
+
+
+def test_an_unused_vertex_far_away_changes_nothing():
+    scene = build(furnished())
+    far = replace(scene, vertices=np.concatenate([scene.vertices, [[0, 0, 1e9]]]).astype(np.float32))
+    first, second = (navigable_floor(one, AGENT, np.random.default_rng(3)).cells for one in (scene, far))
+    assert np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("apart_m", [2.5, 2.75, 3.2])
+def test_stairs_that_are_called_floor_join_no_storeys(apart_m):
+    """Steps of a floor's name lead from one storey to the other; each storey keeps its own free floor."""
+    upper = box("floor", (0, 0, apart_m - 0.2), (4, 3, apart_m))
+    count = int(np.ceil(apart_m / 0.18))
+    rise = apart_m / count
+    steps = [
+        Thing("floor", box("floor", (4 + 0.2 * k, 0, 0), (4.2 + 0.2 * k, 3, apart_m - rise * k)).quads[:1])
+        for k in range(count)
+    ]
+    floor = floor_of(*room((8, 3, 6)), upper, *steps)
+    free = (4 - AGENT.radius_m) * (3 - 2 * AGENT.radius_m)
+    for height in (0, apart_m):
+        storey = (np.abs(floor.cells[:, 2] - height) < 0.01) & (floor.cells[:, 0] < 4)
+        assert storey.sum() * AGENT.grid_m**2 == pytest.approx(free, abs=12 * AGENT.grid_m)
 
 
 def test_poses_are_uniform():

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zerobev.config import LABELS, NO_LABEL
-from zerobev.scenes.categories import label_of
+from zerobev.scenes.categories import is_ceiling, label_of
 
 from support.paths import SHARED
 
@@ -78,3 +78,20 @@ def test_agrees_with_the_whole_table() -> None:
     index = {"tv_monitor" if label == "tv" else label: position for position, label in enumerate(LABELS)}
     expected = {name: index.get(mpcat40, NO_LABEL) for name, mpcat40 in of_name.items()}
     assert {name: label_of(name) for name in expected} == expected
+
+
+@pytest.mark.parametrize("name", ["ceiling", " Ceilling", "kitchen  ceiling", "roof", "ceiling panel", "ceiling /room"])
+def test_ceilings(name: str) -> None:
+    assert is_ceiling(name) and label_of(name) == NO_LABEL
+
+
+@pytest.mark.parametrize("name", ["ceiling lamp", "lamp ceiling", "ceiling fan", "roof window", "floor", ""])
+def test_other_names_are_no_ceilings(name: str) -> None:
+    assert not is_ceiling(name)
+
+
+@pytest.mark.skipif(not TABLE.exists(), reason=f"needs habitat-sim's table of names, {TABLE.name}")
+def test_every_spelling_of_ceiling_in_the_table_is_one() -> None:
+    rows = [line.split("\t") for line in TABLE.read_text().splitlines()[1:]]
+    assert all(is_ceiling(raw) for raw, category, _ in rows if category in ("ceiling", "roof", "ceiling panel"))
+    assert not any(is_ceiling(raw) for raw, _, mpcat40 in rows if mpcat40 in ("lighting", "floor", "wall", "door"))
