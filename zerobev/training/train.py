@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from accelerate import Accelerator
+from accelerate import Accelerator, PartialState
+from accelerate.state import AcceleratorState
 from matplotlib.figure import Figure
 from safetensors.torch import save_model
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from zerobev.common.errors import InputError
 from zerobev.common.progress import progress
@@ -277,10 +278,17 @@ def _step_seed(seed: int, step: int, rank: int) -> int:
 
 
 def training_accelerator(device: torch.device | str | None = None) -> Accelerator:
-    """Accelerate's choice of device, held against the wish, in bfloat16 where the hardware has it."""
+    """An accelerator on the given device, or on a GPU if there is one; in bfloat16 if the device computes in it.
+
+    Raises `InputError` for a device that this machine does not have.
+    """
     wish = None if device is None else torch.device(device).type
     on_gpu = torch.cuda.is_available() and wish != "cpu"
-    bfloat16 = computes_bfloat16("cuda" if on_gpu else "cpu")
+    kind = "cuda" if on_gpu else "cpu"
+    bfloat16 = computes_bfloat16(kind)
+    if PartialState._shared_state and not distributed.is_initialized() and PartialState().device.type != kind:
+        # accelerate keeps the device of its first use in a process
+        AcceleratorState._reset_state(reset_partial_state=True)
     accelerator = Accelerator(cpu=not on_gpu, mixed_precision="bf16" if bfloat16 else "no")
     if wish not in (None, accelerator.device.type):
         raise InputError(f"device: expected {accelerator.device.type}, the one at hand, found {wish}")
