@@ -39,6 +39,8 @@ class PinholeView:
             expected = f"a field of view that covers a pixel of the network's {camera.hfov_deg:g} degrees"
             raise InputError(f"hfov_deg: expected {expected}, found {angle:g}")
         self._area = rows[:, None] * columns
+        #: side, in pixels as small as the images', of all that `camera` sees
+        self.resolution_px = math.ceil(camera.fpv_px * focal_px / camera.focal_px)
 
     def photograph(self, rgb: np.ndarray) -> np.ndarray:
         """(H, W, 3) in [0, 1] -> (S, S, 3) float32: mean colour of what a pixel, or the nearest covered one, sees."""
