@@ -61,7 +61,9 @@ class PinholeView:
         """
         share = np.where(self.covered, self._rows @ image.astype(np.float32) @ self._columns.T, 0)
         most = float(share.max())
-        return share >= min(MASK_SHARE, most) if most > 0 else np.zeros(share.shape, bool)
+        if most == 0:
+            return np.zeros(share.shape, bool)
+        return share >= (MASK_SHARE if most >= MASK_SHARE else most * (1 - 1e-5))  # equal shares differ by rounding
 
 
 def _shares(length_px: int, focal_px: float, camera: CameraConfig) -> np.ndarray:

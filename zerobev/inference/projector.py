@@ -8,7 +8,7 @@ from typing import Any, overload
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
@@ -32,12 +32,23 @@ _MAX_MEDIAN_M = 200.0  # no photograph of a place to walk in shows more
 
 @dataclass(frozen=True, eq=False)
 class Projector:
-    """A network, or P^-1, with the depth estimator and the camera it belongs to."""
+    """A network, or P^-1, with the depth estimator and the camera it belongs to; both are on the CPU.
+
+    Raises `InputError` for one on another device.
+    """
 
     row: str  #: of Tables 1 and 2, or the file that it comes from
     camera: CameraConfig
     network: BevModel | None  #: None: P^-1 (row (a.2))
     estimator: DepthEstimator
+
+    def __post_init__(self) -> None:
+        for name, module in (("network", self.network), ("estimator", self.estimator)):
+            devices = {p.device.type for p in module.parameters()} if isinstance(module, nn.Module) else set()
+            if devices - {"cpu"}:
+                raise InputError(
+                    f"{name}: expected on the CPU, found on {min(devices - {'cpu'})}: move it by .to('cpu')"
+                )
 
     @overload
     def project(self, rgb: Any, modality: Flow, hfov_deg: float = ..., names: None = ...) -> BevArrows: ...

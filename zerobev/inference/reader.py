@@ -40,7 +40,7 @@ MAX_MEGAPIXELS = 120
 
 Source = str | Path | bytes | bytearray | memoryview | BinaryIO | Image.Image
 
-_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "AVIF")
+_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "JPEG2000", "AVIF")
 _GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N")
 _GREY = ("1", "L", "I", "F", *_GREY_16)
 _COLOURS = ("P", "RGB", "RGBX", "CMYK", "YCbCr", "HSV")

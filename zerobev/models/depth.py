@@ -76,9 +76,17 @@ class DepthNet(BevModel):
         return 1 / (F.softplus(fine.float()) + 1 / FARTHEST_M)
 
 
-#: Types of the transformers library that predict metres: side of a square input they are at home with, None where the
-#: configuration has it, and whether that input is normalised.
-METRIC_TYPES = {"depth_anything": (None, True), "glpn": (480, False), "zoedepth": (None, True), "dpt": (None, True)}
+_IMAGENET = (tuple(IMAGENET_MEAN), tuple(IMAGENET_STD))
+_HALVES = ((0.5,) * 3, (0.5,) * 3)
+_NONE = ((0.0,) * 3, (1.0,) * 3)
+#: Types of the transformers library that predict metres: side of a square input as in their training (None: as
+#: configured), and mean and standard deviation of their input, where no image processor says otherwise.
+METRIC_TYPES: dict[str, tuple[int | None, tuple[tuple[float, ...], tuple[float, ...]]]] = {
+    "depth_anything": (None, _IMAGENET),
+    "dpt": (None, _IMAGENET),
+    "glpn": (480, _NONE),
+    "zoedepth": (None, _HALVES),
+}
 _REFUSED = {
     "depth_pro": "inverse depth that depends on the field of view",
     "prompt_depth_anything": "depth that is completed from a second, measured depth image",
@@ -105,20 +113,18 @@ class HubDepth(nn.Module):
         """Wrap a network, to fine-tune it for example; `from_pretrained` checks that one predicts metres.
 
         network: of a type in `METRIC_TYPES`; returns `predicted_depth`, in metres once it is used
-        mean, std: of its RGB input; default: ImageNet's, or 0 and 1 for a type that does not normalise
+        mean, std: of its RGB input; default: the type's
         Raises `InputError` for another type.
         """
         super().__init__()
         kind = network.config.model_type
         if kind not in METRIC_TYPES:
             raise InputError(f"network: {_expected_types()}, found {kind}{_reason(kind)}")
-        side, is_normalised = METRIC_TYPES[kind]
+        side, defaults = METRIC_TYPES[kind]
         self.network = network
         self.side_px = side or _configured_side(network.config)
-        mean = mean or (IMAGENET_MEAN if is_normalised else (0.0,) * 3)
-        std = std or (IMAGENET_STD if is_normalised else (1.0,) * 3)
-        self.register_buffer("mean", torch.tensor(list(mean)).view(3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(list(std)).view(3, 1, 1), persistent=False)
+        for name, given, default in zip(("mean", "std"), (mean, std), defaults):
+            self.register_buffer(name, torch.tensor(list(given or default)).view(3, 1, 1), persistent=False)
 
     @classmethod
     def from_pretrained(cls, source: str | Path, predicts_metres: bool = False) -> Self:
@@ -148,7 +154,7 @@ class HubDepth(nn.Module):
         if report["missing_keys"]:
             raise InputError(f"{source}: expected the weight {min(report['missing_keys'])}, found none of this name")
         if settings.get("do_normalize") is False:
-            settings |= {"image_mean": (0.0,) * 3, "image_std": (1.0,) * 3}
+            settings |= {"image_mean": _NONE[0], "image_std": _NONE[1]}
         return cls(network, settings.get("image_mean"), settings.get("image_std")).eval()
 
     def forward(self, rgb: Tensor) -> Tensor:
