@@ -71,16 +71,16 @@ def stacked(array: np.ndarray, shape: tuple[int, int], channels: Channels, name:
     shape: (H, W) of the photograph
     Raises `InputError` for another shape, and where `channels` is None and both readings fit.
     """
-    shape = tuple(shape)
-    if array.size and array.shape == shape:
+    height, width = shape
+    if array.size and array.shape == (height, width):
         return array[None]
-    first, last = array.ndim == 3 and array.shape[1:] == shape, array.ndim == 3 and array.shape[:2] == shape
+    first = array.ndim == 3 and array.shape[1:] == (height, width)
+    last = array.ndim == 3 and array.shape[:2] == (height, width)
     if first and last and channels is None and len(array) > 1:
         found = f"{array.shape}: say channels='first' or channels='last', as in {name}(array, channels='first')"
         raise InputError(f"modality: expected channels first or last, found both in {found}")
     if array.size and ((first and channels != "last") or (last and channels != "first")):
         return array if first and channels != "last" else np.moveaxis(array, -1, 0)
-    height, width = shape
     expected = f"({height}, {width}) or (K, {height}, {width})"
     expected = f"({height}, {width}, K)" if channels == "last" else expected
     hint = ""

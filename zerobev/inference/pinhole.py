@@ -40,7 +40,7 @@ class PinholeView:
             raise InputError(f"hfov_deg: expected {expected}, found {angle:g}")
         self._area = rows[:, None] * columns
         #: side, in pixels as small as the images', of all that `camera` sees
-        self.resolution_px = math.ceil(camera.fpv_px * focal_px / camera.focal_px)
+        self.resolution_px = math.ceil(round(camera.fpv_px * focal_px / camera.focal_px, 6))
 
     def photograph(self, rgb: np.ndarray) -> np.ndarray:
         """(H, W, 3) in [0, 1] -> (S, S, 3) float32: mean colour of what a pixel, or the nearest covered one, sees."""

@@ -143,8 +143,7 @@ def _open(source: Source, what: str) -> _Opened:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is checked below
             image = source if isinstance(source, Image.Image) else Image.open(_file(source), formats=_FORMATS)
         _check_size(image, name)
-        codec, _, _, arguments = (*image.tile, (None,) * 4)[0] if getattr(image, "tile", None) else (None,) * 4
-        rawmode = arguments if isinstance(arguments, str) else (arguments or ("",))[0]
+        codec, rawmode = _stored_as(image)
         frames = getattr(image, "n_frames", 1)
         image.load()
         upright = ImageOps.exif_transpose(image)
@@ -166,6 +165,15 @@ def _open(source: Source, what: str) -> _Opened:
     is_lossy = image.format in ("JPEG", "MPO", "JPEG2000") or compression in ("jpeg", "tiff_jpeg", "webp")
     is_rescaled = image.format == "PPM" and codec in ("ppm", "ppm_plain")
     return _Opened(upright, name, is_lossy, is_rescaled, _SPREAD.get(rawmode, 1))
+
+
+def _stored_as(image: Image.Image) -> tuple[str, str]:
+    """Pillow's names of the codec and of the packing of pixels in a file that is not loaded yet; else empty."""
+    tiles = getattr(image, "tile", None)
+    if not tiles:
+        return "", ""
+    codec, arguments = tiles[0][0], tiles[0][3]
+    return codec, str(arguments[0] if isinstance(arguments, tuple) else arguments)
 
 
 def _file(source: str | Path | bytes | bytearray | memoryview | BinaryIO) -> Path | BinaryIO:
