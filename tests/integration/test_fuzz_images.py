@@ -81,8 +81,9 @@ def any_file(rng: Random) -> bytes:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             image.save(stream, kind, **options)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, SystemError):
-        image.convert("RGB").save(stream, "PNG")  # this format has no such mode or option
+    except Exception:  # this format has no such mode or option
+        stream = io.BytesIO()
+        Image.new(rng.choice(("L", "RGB")), (9, 7)).save(stream, "PNG")
     content = bytearray(stream.getvalue())
     damage = rng.randrange(6)
     if damage == 0:
@@ -99,8 +100,8 @@ def test_image_files(read, dtype):
         array = read(content)
         assert array.dtype == dtype and array.ndim == (3 if read is read_image else 2) and array.size
 
-    seen = fuzz(1500, any_file, parse)
-    assert min(seen["taken"], seen["refused"]) > 150
+    seen = fuzz(600, any_file, parse)
+    assert min(seen["taken"], seen["refused"]) > 60
 
 
 def test_flo_files(tmp_path):

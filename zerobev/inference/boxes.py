@@ -37,8 +37,8 @@ class Boxes:
 
     def __post_init__(self) -> None:
         try:
-            object.__setattr__(self, "corners", as_array(self.corners, "boxes").astype(np.float64))
-            object.__setattr__(self, "scores", as_array(self.scores, "boxes").astype(np.float64))
+            object.__setattr__(self, "corners", as_array(self.corners, "boxes").astype(np.float64, casting="same_kind"))
+            object.__setattr__(self, "scores", as_array(self.scores, "boxes").astype(np.float64, casting="same_kind"))
             object.__setattr__(self, "labels", tuple(map(str, self.labels)))
         except (ValueError, TypeError, OverflowError) as error:
             raise InputError(f"boxes: expected numbers as corners and scores, and labels, found {error}") from None

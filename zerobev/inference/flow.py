@@ -44,7 +44,9 @@ class Flow:
     def __post_init__(self) -> None:
         try:
             for name in ("start_px", "end_px"):
-                object.__setattr__(self, name, as_array(getattr(self, name), "flow").astype(np.float64))
+                object.__setattr__(
+                    self, name, as_array(getattr(self, name), "flow").astype(np.float64, casting="same_kind")
+                )
         except (ValueError, TypeError, OverflowError) as error:
             raise InputError(f"flow: expected numbers as starts and ends, found {error}") from None
         shapes = np.shape(self.start_px), np.shape(self.end_px)
