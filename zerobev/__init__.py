@@ -6,11 +6,11 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from zerobev.inference import BevArrows, BevMap, Boxes, Flow, Projector, load
+    from zerobev.inference import BevArrows, BevMap, Boxes, Flow, Labels, Masks, Probabilities, Projector, load
 
 __version__ = "0.2.0.dev0"
 
-__all__ = ["BevArrows", "BevMap", "Boxes", "Flow", "Projector", "load"]
+__all__ = ["BevArrows", "BevMap", "Boxes", "Flow", "Labels", "Masks", "Probabilities", "Projector", "load"]
 
 
 def __getattr__(name: str) -> Any:

@@ -448,7 +448,7 @@ def test_arguments_of_project(projector: zerobev.Projector) -> None:
 
 def test_valid_arguments_of_project_are_taken(projector: zerobev.Projector) -> None:
     images = [_RGB, _RGB / 255, (_RGB / 255).astype(np.float16), (_RGB / 255).tolist(), np.asfortranarray(_RGB)]
-    modalities = [_MASKS, _MASKS[0], _MASKS[0].astype(int), _MASKS * 0.5, _MASKS.astype(">f4"), _MASKS[0].tolist()]
+    modalities = [_MASKS, _MASKS[0], _MASKS[0] + 1, _MASKS * 0.5, _MASKS.astype(">f4"), _MASKS[0].tolist()]
     modalities += [zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]), zerobev.Flow([[1, 1]], [[1e300, 2]])]
     for image, modality in zip(images * 2, modalities):
         projector.project(image, modality, np.float32(66))

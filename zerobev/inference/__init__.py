@@ -1,9 +1,29 @@
-"""What people want on a map: masks, labels, values, boxes, flow; each becomes binary images, and maps come back."""
+"""Projection of anything known in a photograph: masks, labels, probabilities, boxes, flow."""
 
 from zerobev.inference.bev_map import BevArrows, BevMap
 from zerobev.inference.boxes import Boxes
 from zerobev.inference.detector import HubDetector
 from zerobev.inference.flow import Flow
+from zerobev.inference.labels import Labels
+from zerobev.inference.masks import Masks
+from zerobev.inference.modality import Modality
+from zerobev.inference.probabilities import Probabilities
 from zerobev.inference.projector import Projector, load
+from zerobev.inference.reader import read_image, read_labels, read_mask
 
-__all__ = ["BevArrows", "BevMap", "Boxes", "Flow", "HubDetector", "Projector", "load"]
+__all__ = [
+    "BevArrows",
+    "BevMap",
+    "Boxes",
+    "Flow",
+    "HubDetector",
+    "Labels",
+    "Masks",
+    "Modality",
+    "Probabilities",
+    "Projector",
+    "load",
+    "read_image",
+    "read_labels",
+    "read_mask",
+]

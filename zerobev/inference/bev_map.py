@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
+from zerobev.common.errors import InputError
 from zerobev.common.storage import replacing
 from zerobev.config import CameraConfig
 
@@ -95,20 +96,31 @@ class BevMap:
             axes.legend(handles=patches, fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
         return axes
 
-    def save(self, path: Path) -> None:
-        """Write one NPZ file: values, maps, fov, labels, extent (metres), cell_m, and scores if there are any."""
+    def save(self, path: str | Path) -> None:
+        """Write one NPZ file: values, maps, fov, labels, extent (metres), cell_m, and scores if there are any.
+
+        path: ends in `.npz`, which is added to a name without a suffix
+        Raises `InputError` for another suffix, and where no file can be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in ("", ".npz") or not path.name:
+            raise InputError(f"path: expected a name that ends in .npz, found {str(path)!r}")
+        path = path if path.suffix else path.with_name(f"{path.name}.npz")
         scores = {} if self.scores is None else {"scores": self.scores}
-        with replacing(path) as temporary:
-            np.savez_compressed(
-                temporary,
-                values=self.values,
-                maps=self.maps,
-                fov=self.fov,
-                labels=np.array(self.labels),
-                extent=self.extent,
-                cell_m=self.cell_m,
-                **scores,  # type: ignore[arg-type]  # NumPy's stub takes all for `allow_pickle`
-            )
+        try:
+            with replacing(path) as temporary, temporary.open("wb") as file:
+                np.savez_compressed(
+                    file,
+                    values=self.values,
+                    maps=self.maps,
+                    fov=self.fov,
+                    labels=np.array(self.labels),
+                    extent=self.extent,
+                    cell_m=self.cell_m,
+                    **scores,  # type: ignore[arg-type]  # NumPy's stub takes all for `allow_pickle`
+                )
+        except (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
+            raise InputError(f"{path}: expected a file that can be written, found: {error.strerror}") from None
 
     def _title(self, k: int) -> str:
         return self.labels[k] if self.scores is None else f"{self.labels[k]} {self.scores[k]:.2f}"

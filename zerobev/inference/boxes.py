@@ -1,18 +1,23 @@
 """Detected objects as filled boxes (paper, Section 4, "Additional zero-shot capabilities" figure of objects)."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import pandas as pd
 from skimage.measure import regionprops
 
 from zerobev.common.errors import InputError
-from zerobev.inference.images import BinaryImages
+from zerobev.inference.arrays import as_array
+from zerobev.inference.bev_map import BevMap
+from zerobev.inference.modality import BinaryImages
 
 _SIDES = ("xmin", "ymin", "xmax", "ymax")
+_MAX_FRACTION = 1.5  # corners given as fractions reach a little beyond the image
+Form = Literal["xyxy", "xywh", "cxcywh"]
+
 _LEAST_PX = 12  # an instance of fewer pixels is found by no detector
 
 
@@ -20,8 +25,9 @@ _LEAST_PX = 12  # an instance of fewer pixels is found by no detector
 class Boxes:
     """N detections in one photograph.
 
+    Other formats than corners in pixels: `Boxes.of`.
     Raises `InputError` for arrays that do not fit each other, for corners that are not finite or in the wrong order,
-    and for scores outside [0, 1].
+    for corners that all lie within one pixel, as fractions of the image do, and for scores outside [0, 1].
     """
 
     corners: np.ndarray  #: (N, 4) float64: left, top, right, bottom, in pixels from the image's upper left corner
@@ -31,8 +37,8 @@ class Boxes:
 
     def __post_init__(self) -> None:
         try:
-            object.__setattr__(self, "corners", np.asarray(self.corners, np.float64))
-            object.__setattr__(self, "scores", np.asarray(self.scores, np.float64))
+            object.__setattr__(self, "corners", as_array(self.corners, "boxes").astype(np.float64, casting="same_kind"))
+            object.__setattr__(self, "scores", as_array(self.scores, "boxes").astype(np.float64, casting="same_kind"))
             object.__setattr__(self, "labels", tuple(map(str, self.labels)))
         except (ValueError, TypeError, OverflowError) as error:
             raise InputError(f"boxes: expected numbers as corners and scores, and labels, found {error}") from None
@@ -43,9 +49,48 @@ class Boxes:
         for number, (left, top, right, bottom) in enumerate(self.corners):
             if not (np.isfinite([left, top, right, bottom]).all() and left < right and top < bottom):
                 found = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
-                raise InputError(f"boxes: expected xmin < xmax and ymin < ymax in box {number}, found {found}")
+                hint = "; for x, y, width, height say Boxes.of(..., form='xywh')"
+                raise InputError(f"boxes: expected xmin < xmax and ymin < ymax in box {number}, found {found}{hint}")
+        if count and np.abs(self.corners).max() <= _MAX_FRACTION:
+            hint = "for fractions of the image say Boxes.of(..., size=(height, width))"
+            raise InputError(f"boxes: expected corners in pixels, found none above {self.corners.max():g}; {hint}")
         if not all(0 <= score <= 1 for score in self.scores):
             raise InputError(f"boxes: expected scores in [0, 1], found {np.min(self.scores)} to {np.max(self.scores)}")
+
+    @classmethod
+    def of(
+        cls,
+        values: Any,
+        labels: Iterable[str],
+        scores: Any = None,
+        form: Form = "xyxy",
+        size: tuple[int, int] | None = None,
+    ) -> Self:
+        """Boxes in another format.
+
+        values: (N, 4) numbers. form "xyxy": left, top, right, bottom; "xywh": left, top, width, height, as in COCO;
+            "cxcywh": centre, width, height, as YOLO and DETR have them
+        scores: N in [0, 1]; default: 1
+        size: (H, W) of the photograph, where the values are fractions of it; None: they are pixels
+        Raises `InputError` as the class does, and for fractions outside [-0.5, 1.5].
+        """
+        boxes, labels = as_array(values, "boxes"), tuple(labels)
+        if boxes.ndim != 2 or boxes.shape[1] != 4 or boxes.dtype.kind not in "iuf":
+            raise InputError(f"boxes: expected numbers (N, 4), found {boxes.dtype} {boxes.shape}")
+        first, second = boxes[:, :2].astype(np.float64), boxes[:, 2:].astype(np.float64)
+        if form == "xyxy":
+            corners = np.hstack([first, second])
+        elif form == "xywh":
+            corners = np.hstack([first, first + second])
+        elif form == "cxcywh":
+            corners = np.hstack([first - second / 2, first + second / 2])
+        else:
+            raise InputError(f"form: expected xyxy, xywh or cxcywh, found {form!r}")
+        if size is not None:
+            if not (np.abs(corners) <= _MAX_FRACTION).all():
+                raise InputError(f"boxes: expected fractions of the image, found up to {np.abs(corners).max():g}")
+            corners = corners * np.array([size[1], size[0]] * 2)
+        return cls(corners, labels, np.ones(len(corners)) if scores is None else scores)
 
     @classmethod
     def from_table(cls, table: pd.DataFrame, source: str = "given") -> Self:
@@ -71,10 +116,26 @@ class Boxes:
         return cls.from_table(table, str(path))
 
     def images(self, shape: tuple[int, int]) -> BinaryImages:
-        """Each box as a filled mask of a photograph of `shape` (H, W); no box at all is an `InputError`."""
+        """Each box as a filled mask of a photograph of `shape` (H, W).
+
+        Raises `InputError` for no box at all, and for one that lies outside: it belongs to an image of another size.
+        """
         if not self.labels:
             raise InputError("modality: expected at least one box, found none")
+        height, width = shape
+        for number, (left, top, right, bottom) in enumerate(self.corners):
+            if left >= width or top >= height or right <= 0 or bottom <= 0:
+                found = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
+                raise InputError(f"modality: expected box {number} within {width} x {height} pixels, found {found}")
         return BinaryImages(self.labels, self._filled(shape), scores=np.asarray(self.scores, np.float64))
+
+    def layers(self, shape: tuple[int, int]) -> tuple[BinaryImages]:
+        """As `images`."""
+        return (self.images(shape),)
+
+    def result(self, maps: tuple[BevMap, ...]) -> BevMap:
+        """One map per box, with its label and score."""
+        return maps[0]
 
     def _filled(self, shape: tuple[int, int]) -> Iterator[np.ndarray]:
         for corners in self.corners:

@@ -1,20 +1,22 @@
 """Object detectors of the `transformers` library."""
 
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
-from transformers import AutoImageProcessor, AutoModelForObjectDetection, BaseImageProcessor, PreTrainedModel
 
 from zerobev.common.errors import InputError
 from zerobev.inference.boxes import Boxes
+
+if TYPE_CHECKING:
+    from transformers import BaseImageProcessor, PreTrainedModel
 
 
 class HubDetector:
     """A detector with the image processor that belongs to it (DETR, YOLOS, RT-DETR, ...)."""
 
-    def __init__(self, network: PreTrainedModel, processor: BaseImageProcessor, source: str) -> None:
+    def __init__(self, network: "PreTrainedModel", processor: "BaseImageProcessor", source: str) -> None:
         self._network, self._processor, self._source = network.eval(), processor, source
 
     @classmethod
@@ -23,6 +25,8 @@ class HubDetector:
 
         Raises `InputError` where there is none, or one that lacks weights or its image processor.
         """
+        from transformers import AutoImageProcessor, AutoModelForObjectDetection  # takes seconds
+
         try:
             network, report = AutoModelForObjectDetection.from_pretrained(str(source), output_loading_info=True)
             processor = AutoImageProcessor.from_pretrained(str(source))

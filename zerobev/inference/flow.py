@@ -4,7 +4,8 @@ Each vector is projected as two images: a filled circle at its start, and one at
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -13,12 +14,18 @@ from skimage.draw import disk
 from skimage.registration import optical_flow_ilk, optical_flow_tvl1
 
 from zerobev.common.errors import InputError
-from zerobev.inference.images import BinaryImages
+from zerobev.inference.arrays import as_array, checked_image
+from zerobev.inference.bev_map import BevArrows, BevMap
+from zerobev.inference.modality import BinaryImages
 
 METHODS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "tvl1": optical_flow_tvl1,
     "ilk": optical_flow_ilk,
 }
+#: Components beyond are unknown, by the convention of `.flo` files.
+UNKNOWN_PX = 1e9
+
+_FLO = b"PIEH"  # 202021.25 as float32
 _RADIUS = 1 / 32  # of a disc, as a share of the image's width
 _SPACING = 1 / 24  # of vectors, likewise
 
@@ -37,7 +44,9 @@ class Flow:
     def __post_init__(self) -> None:
         try:
             for name in ("start_px", "end_px"):
-                object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
+                object.__setattr__(
+                    self, name, as_array(getattr(self, name), "flow").astype(np.float64, casting="same_kind")
+                )
         except (ValueError, TypeError, OverflowError) as error:
             raise InputError(f"flow: expected numbers as starts and ends, found {error}") from None
         shapes = np.shape(self.start_px), np.shape(self.end_px)
@@ -56,24 +65,31 @@ class Flow:
     ) -> Self:
         """The vectors of a flow field that are longer than `min_px`, on a grid.
 
-        field: (H, W, 2) floating point, pixels to the right and down that each pixel moves
+        field: (H, W, 2) floating point, pixels to the right and down that each pixel moves. Unknown where a component
+            is NaN or beyond 1e9, as in Middlebury's files: no vector starts there.
         spacing_px: of the grid; default: a 24th of the width
-        Raises `InputError` for another shape or type, for NaN, and where nothing moves that far.
+        Raises `InputError` for another shape or type, and where nothing is known to move that far.
         """
-        field = np.asarray(field)
+        field = as_array(field, "flow")
         if field.ndim != 3 or field.shape[-1] != 2 or field.dtype.kind != "f" or not field.size:
-            raise InputError(f"flow: expected floating point (H, W, 2), found {field.dtype} {field.shape}")
-        if not np.isfinite(field).all():
-            raise InputError("flow: expected finite vectors, found NaN or infinity")
+            hint = ": move the components last" if field.ndim == 3 and field.shape[0] == 2 else ""
+            raise InputError(f"flow: expected floating point (H, W, 2), found {field.dtype} {field.shape}{hint}")
         step = spacing_px or max(1, round(field.shape[1] * _SPACING))
         rows, columns = (np.arange(step // 2, length, step) for length in field.shape[:2])
         x, y = np.meshgrid(columns, rows)
         vector = field[y, x].astype(np.float64)
-        moving = np.linalg.norm(vector, axis=-1) >= min_px
+        known = (np.abs(vector) <= UNKNOWN_PX).all(axis=-1)  # not NaN either
+        moving = known & (np.linalg.norm(np.where(known[..., None], vector, 0), axis=-1) >= min_px)
         if not moving.any():
-            raise InputError(f"flow: expected a vector of {min_px:g} px at least, found none")
+            found = f"none; {known.mean():.0%} of the vectors are known"
+            raise InputError(f"flow: expected a vector of {min_px:g} px at least, found {found}")
         start = np.stack([x, y], axis=-1)[moving] + 0.5
         return cls(start, start + vector[moving], after)
+
+    @classmethod
+    def read(cls, path: str | Path, after: np.ndarray | None = None, min_px: float = 1.0, **grid: int | None) -> Self:
+        """As `of`, from a `.flo` file of Middlebury's benchmark. Raises `InputError` for any other file."""
+        return cls.of(read_flo(path), after, min_px, **grid)
 
     @classmethod
     def between(
@@ -82,11 +98,44 @@ class Flow:
         """The flow from one photograph to the next, (H, W, 3), with the second as `after`; see `flow_field`, `of`."""
         return cls.of(flow_field(first, second, method), second, min_px, **grid)
 
+    def layers(self, shape: tuple[int, int]) -> tuple[BinaryImages, BinaryImages]:
+        """`discs`, those at the ends with the second frame; an `InputError` if it has another size than the first."""
+        starts, ends = self.discs(shape)
+        if self.after is None:
+            return starts, ends
+        after = checked_image(self.after)
+        if after.shape[:2] != tuple(shape):
+            raise InputError(f"after: expected the first frame's shape {(*shape, 3)}, found {after.shape}")
+        return starts, replace(ends, photograph=after)
+
+    def result(self, maps: tuple[BevMap, ...]) -> BevArrows:
+        """Arrows between the maps of starts and ends."""
+        return BevArrows(*maps)
+
     def discs(self, shape: tuple[int, int]) -> tuple[BinaryImages, BinaryImages]:
         """A filled circle at each start, and one at each end, in photographs of `shape` (H, W)."""
         labels = tuple(map(str, range(len(self.start_px))))
         starts, ends = (_discs(points, shape) for points in (self.start_px, self.end_px))
         return BinaryImages(labels, starts), BinaryImages(labels, ends)
+
+
+def read_flo(path: str | Path) -> np.ndarray:
+    """The field (H, W, 2) float32 of a `.flo` file: pixels to the right and down, unknown beyond `UNKNOWN_PX`.
+
+    Raises `InputError` where the file is missing, of another kind (KITTI's flow is PNG), or not of the size it states.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: expected a .flo file, found: {error.strerror}") from None
+    if content[:4] != _FLO:
+        hint = "; decode it yourself and say Flow.of(field)" if content[:4] == b"\x89PNG" else ""
+        raise InputError(f"{path}: expected a .flo file that starts with {_FLO!r}, found {content[:4]!r}{hint}")
+    width, height = (int(side) for side in np.frombuffer(content[4:12].ljust(8, b"\0"), "<i4"))
+    if width < 1 or height < 1 or len(content) != 12 + 8 * width * height:
+        found = f"{width} x {height} pixels in {len(content)} bytes"
+        raise InputError(f"{path}: expected 12 bytes and 8 per pixel, found {found}")
+    return np.frombuffer(content, "<f4", offset=12).reshape(height, width, 2).astype(np.float32)
 
 
 def flow_field(first: np.ndarray, second: np.ndarray, method: str = "tvl1") -> np.ndarray:

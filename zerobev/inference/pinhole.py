@@ -39,6 +39,8 @@ class PinholeView:
             expected = f"a field of view that covers a pixel of the network's {camera.hfov_deg:g} degrees"
             raise InputError(f"hfov_deg: expected {expected}, found {angle:g}")
         self._area = rows[:, None] * columns
+        #: side, in pixels as small as the images', of all that `camera` sees
+        self.resolution_px = math.ceil(round(camera.fpv_px * focal_px / camera.focal_px, 6))
 
     def photograph(self, rgb: np.ndarray) -> np.ndarray:
         """(H, W, 3) in [0, 1] -> (S, S, 3) float32: mean colour of what a pixel, or the nearest covered one, sees."""
@@ -59,7 +61,9 @@ class PinholeView:
         """
         share = np.where(self.covered, self._rows @ image.astype(np.float32) @ self._columns.T, 0)
         most = float(share.max())
-        return share >= min(MASK_SHARE, most) if most > 0 else np.zeros(share.shape, bool)
+        if most == 0:
+            return np.zeros(share.shape, bool)
+        return share >= (MASK_SHARE if most >= MASK_SHARE else most * (1 - 1e-5))  # equal shares differ by rounding
 
 
 def _shares(length_px: int, focal_px: float, camera: CameraConfig) -> np.ndarray:

@@ -1,22 +1,24 @@
 """The trained networks, ready for use: `zerobev.load().project(rgb, modality)`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
 from zerobev.geometry.projection import fov_mask, inverse_project
+from zerobev.inference.arrays import checked_image
 from zerobev.inference.bev_map import BevArrows, BevMap
-from zerobev.inference.boxes import Boxes
 from zerobev.inference.flow import Flow
-from zerobev.inference.images import BinaryImages, Names, binary_images
+from zerobev.inference.modality import BinaryImages, Modality, Names
 from zerobev.inference.pinhole import PinholeView
+from zerobev.inference.plain_arrays import kind_of
 from zerobev.inference.shipped_weights import DEPTH, ROWS, shipped
 from zerobev.models import TIM, VPN, BevModel, load_model
 from zerobev.models.depth import DepthEstimator, DepthNet
@@ -25,31 +27,49 @@ from zerobev.models.depth import DepthEstimator, DepthNet
 GEOMETRIC = "a.2"
 #: Binary images that one call takes; a network holds the features of all of them at once.
 MAX_IMAGES = 2048
+_MAX_MEDIAN_M = 200.0  # no photograph of a place to walk in shows more
 
 
 @dataclass(frozen=True, eq=False)
 class Projector:
-    """A network, or P^-1, with the depth estimator and the camera it belongs to."""
+    """A network, or P^-1, with the depth estimator and the camera it belongs to; both are on the CPU.
+
+    Raises `InputError` for one on another device.
+    """
 
     row: str  #: of Tables 1 and 2, or the file that it comes from
     camera: CameraConfig
     network: BevModel | None  #: None: P^-1 (row (a.2))
     estimator: DepthEstimator
 
-    def project(
-        self, rgb: np.ndarray, modality: Any, hfov_deg: float = 79.0, names: Names = None
-    ) -> BevMap | BevArrows:
+    def __post_init__(self) -> None:
+        for name, module in (("network", self.network), ("estimator", self.estimator)):
+            devices = {p.device.type for p in module.parameters()} if isinstance(module, nn.Module) else set()
+            if devices - {"cpu"}:
+                raise InputError(
+                    f"{name}: expected on the CPU, found on {min(devices - {'cpu'})}: move it by .to('cpu')"
+                )
+
+    @overload
+    def project(self, rgb: Any, modality: Flow, hfov_deg: float = ..., names: None = ...) -> BevArrows: ...
+
+    @overload
+    def project(self, rgb: Any, modality: Any, hfov_deg: float = ..., names: Names = ...) -> BevMap: ...
+
+    def project(self, rgb: Any, modality: Any, hfov_deg: float = 79.0, names: Names = None) -> BevMap | BevArrows:
         """Project what is known in a photograph to the map of the 5 m in front of its camera.
 
-        rgb: (H, W, 3) uint8, or floating point in [0, 1], of any size
+        rgb: (H, W, 3) uint8, or floating point in [0, 1], of any size up to `reader.MAX_MEGAPIXELS`; or an image file
+            (path, bytes, open file, PIL image), see `zerobev.inference.reader`
         modality: of the same size, one of
-            - bool (H, W) or (K, H, W): masks
-            - integers (H, W): a label map; every label from 0 up becomes a map, with one pass of RGB features
-            - floating point (H, W) or (K, H, W) in [0, 1]: real values, see `zerobev.inference.images`
-            - `Boxes`: one map a detection, with its label and score
-            - `Flow`, or floating point (H, W, 2), pixels right and down: arrows
+            - `Masks`, `Labels`, `Probabilities`: one map per mask, label, image
+            - `Boxes`: one map per detection, with its label and score
+            - `Flow`: arrows
+            - another `Modality`
+            - an array whose type and values leave one kind: bool (H, W) or (K, H, W) masks; integers (H, W) labels;
+              floating point (H, W) or (K, H, W) probabilities. See `plain_arrays.kind_of` for those that do not.
         hfov_deg: the photograph's horizontal field of view; its pixels are square
-        names: of masks or of labels; default: their numbers
+        names: of the masks, labels or images of an array; default: their numbers
 
         The network's camera is level, 0.88 m above the floor, and sees 79 degrees; a photograph is resampled to it. Of
         that view, what the photograph does not cover goes on with the colours at its border, masks are empty there, and
@@ -57,33 +77,37 @@ class Projector:
         A photograph taken from another height, or tilted, gives maps that are off by as much as that moves the floor in
         the image. Maps of empty masks are empty.
 
-        Returns a `BevMap`, or `BevArrows` for flow. Raises `InputError` for wrong shapes, types or ranges, NaN, input
-        that is empty, and more than `MAX_IMAGES` binary images (real values are eight each).
+        Returns a `BevArrows` for `Flow`, else a `BevMap`. Raises `InputError` for wrong shapes, types or ranges, NaN,
+        input that is empty, arrays that can be read in two ways, and more than `MAX_IMAGES` binary images (real values
+        are eight each).
         """
         photograph = checked_image(rgb)
         shape = photograph.shape[:2]
-        if not isinstance(modality, Boxes | Flow):
-            modality = _array(modality, "modality")
-            if modality.shape == (*shape, 2):
-                modality = Flow.of(modality)
-        if isinstance(modality, Flow):
-            after = photograph if modality.after is None else checked_image(modality.after)
-            if after.shape != photograph.shape:
-                raise InputError(f"after: expected the first frame's shape {photograph.shape}, found {after.shape}")
-            starts, ends = modality.discs(shape)
-            return BevArrows(self._maps(photograph, starts, hfov_deg), self._maps(after, ends, hfov_deg))
-        images = modality.images(shape) if isinstance(modality, Boxes) else binary_images(modality, shape, names)
-        return self._maps(photograph, images, hfov_deg)
+        kind = _kind(modality, shape, names)
+        layers = kind.layers(shape)
+        frames = (photograph if layer.photograph is None else layer.photograph for layer in layers)
+        return kind.result(tuple(self._maps(frame, layer, hfov_deg) for frame, layer in zip(frames, layers)))
 
-    def depth(self, rgb: np.ndarray, hfov_deg: float = 79.0) -> np.ndarray:
+    def depth(self, rgb: Any, hfov_deg: float = 79.0) -> np.ndarray:
         """Estimated planar depth in the network's camera, (S, S) float32, metres; 0 where nothing is covered."""
         photograph = checked_image(rgb)
         view = PinholeView(photograph.shape[:2], hfov_deg, self.camera)
         with torch.inference_mode():
-            return self._depth(_batch(view.photograph(photograph)), view)[0, 0].numpy()
+            return self._depth(photograph, hfov_deg, view)[0, 0].numpy()
 
-    def _depth(self, rgb: Tensor, view: PinholeView) -> Tensor:
-        return self.estimator(rgb) * torch.from_numpy(view.covered)
+    def _depth(self, photograph: np.ndarray, hfov_deg: float, view: PinholeView) -> Tensor:
+        """(1, 1, S, S) metres. An estimator with an input size of its own sees the photograph at that size."""
+        side = self.camera.fpv_px
+        own_px = max(getattr(self.estimator, "side_px", side), side)
+        seen = view
+        if own_px > side and (in_view := view.resolution_px) > side:
+            # not larger than the photograph, which the estimator enlarges smoothly
+            camera = replace(self.camera, fpv_px=min(own_px, in_view))
+            seen = PinholeView(photograph.shape[:2], hfov_deg, camera)
+        depth = _checked_depth(self.estimator(_batch(seen.photograph(photograph))), seen.covered.shape)
+        if depth.shape[-1] != side:
+            depth = F.interpolate(depth, size=(side, side), mode="bilinear", align_corners=False)
+        return depth * torch.from_numpy(view.covered)
 
     @torch.inference_mode()
     def _maps(self, photograph: np.ndarray, images: BinaryImages, hfov_deg: float) -> BevMap:
@@ -92,7 +116,7 @@ class Projector:
             raise InputError(f"modality: expected {MAX_IMAGES} binary images at most, found {count}")
         zero = torch.from_numpy(np.stack([view.mask(image) for image in images.images])).float()
         rgb = _batch(view.photograph(photograph))
-        depth = self._depth(rgb, view)
+        depth = self._depth(photograph, hfov_deg, view)
         maps = torch.zeros(2, len(zero), self.camera.bev_px, self.camera.bev_px)  # values and evidence
         filled = zero.flatten(1).any(dim=1)
         if filled.any():
@@ -141,27 +165,26 @@ def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None)
     return Projector(str(source), network.camera, network, depth)
 
 
-def checked_image(rgb: Any) -> np.ndarray:
-    """(H, W, 3) uint8, or floating point in [0, 1] -> float32 in [0, 1]; all else is an `InputError`."""
-    array = _array(rgb, "rgb")
-    if array.ndim != 3 or array.shape[-1] != 3 or not array.size:
-        raise InputError(f"rgb: expected (H, W, 3), found {array.shape}")
-    if array.dtype == np.uint8:
-        return array.astype(np.float32) / 255
-    if array.dtype.kind != "f":
-        raise InputError(f"rgb: expected uint8 or floating point, found {array.dtype}")
-    if not np.isfinite(array).all():
-        raise InputError("rgb: expected values in [0, 1], found NaN or infinity")
-    if array.min() < 0 or array.max() > 1:
-        raise InputError(f"rgb: expected values in [0, 1], found {array.min():g} to {array.max():g}")
-    return array.astype(np.float32)
+def _kind(modality: Any, shape: tuple[int, int], names: Names) -> Modality[Any]:
+    if not isinstance(modality, Modality):
+        return kind_of(modality, shape, names)
+    if names is None:
+        return modality
+    if getattr(modality, "names", ()) is not None:
+        raise InputError(f"names: expected none beside {type(modality).__name__}, which has its own")
+    return replace(modality, names=names)  # type: ignore[type-var]  # a dataclass with a field of this name
 
 
-def _array(value: Any, name: str) -> np.ndarray:
-    try:
-        return np.asarray(value)
-    except (ValueError, TypeError, RuntimeError, OverflowError):
-        raise InputError(f"{name}: expected an array, found {type(value).__name__} that is none") from None
+def _checked_depth(depth: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """What an estimator returned, (1, 1, S, S); an `InputError` where it cannot be metres."""
+    expected = (1, 1, *shape)
+    if tuple(depth.shape) != expected:
+        raise InputError(f"estimator: expected depth {expected}, found {tuple(depth.shape)}")
+    if not (torch.isfinite(depth).all() and (depth >= 0).all()):
+        raise InputError("estimator: expected finite depth from 0 up, found NaN, infinity or less")
+    if (median := float(depth.median())) > _MAX_MEDIAN_M:
+        raise InputError(f"estimator: expected depth in metres, found a median of {median:g}: millimetres?")
+    return depth
 
 
 def _batch(photograph: np.ndarray) -> Tensor:

@@ -1,6 +1,7 @@
 """Modalities as binary images and back: resampling against a closed form, boxes and flow by hand, objects that move."""
 
 import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +18,7 @@ from zerobev.evaluation.motion import MovingPair, arrow_errors, motion_table, mo
 from zerobev.geometry.cameras import Pose
 from zerobev.inference import BevMap, Boxes, Flow, HubDetector, Projector
 from zerobev.inference.boxes import rendered_boxes
-from zerobev.inference.flow import flow_field
-from zerobev.inference.images import LEVELS, binary_images
+from zerobev.inference.flow import flow_field, read_flo
 from zerobev.inference.pinhole import PinholeView
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer
@@ -97,43 +97,6 @@ def test_a_field_of_view_that_is_none_is_refused(hfov):
         PinholeView((48, 48), hfov, CAMERA)
 
 
-# --- arrays -------------------------------------------------------------------------------------------------------
-
-
-def test_labels_become_masks_and_values_their_level_sets():
-    labels = np.array([[2, 2, -1], [0, 7, 7]])
-    images = binary_images(labels, (2, 3), {0: "wall", 2: "bed", 7: "tv"})
-    assert images.labels == ("wall", "bed", "tv") and images.levels == 1
-    np.testing.assert_array_equal(np.stack(list(images.images)), np.stack([labels == k for k in (0, 2, 7)]))
-    values = np.linspace(0, 1, 6).reshape(2, 3).astype(np.float32)
-    images = binary_images(values, (2, 3))
-    assert images.levels == LEVELS and images.labels == ("0",)
-    assert np.abs(np.mean(list(images.images), axis=0) - values).max() <= 0.5 / LEVELS + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("modality", "message"),
-    [
-        (np.zeros((3, 4), bool), r"expected \(2, 3\) or \(K, 2, 3\) of bool, found \(3, 4\)"),
-        (np.zeros((0, 2, 3), bool), r"found \(0, 2, 3\)"),
-        (np.zeros((2, 2, 3), int), r"expected \(2, 3\) of int64, found .*a stack of masks has to be bool"),
-        (np.full((2, 3), -1), r"expected 1 to 256 labels from 0 up, found 0"),
-        (np.full((2, 3), np.nan), r"found NaN or infinity"),
-        (np.full((2, 3), 1.5), r"expected values in \[0, 1\], found 1.5 to 1.5"),
-        (np.array([["a"] * 3] * 2), r"expected an array of bool, integers or floating point, found <U1"),
-        (None, r"found object"),
-    ],
-)
-def test_arrays_that_mean_nothing_are_refused(modality, message):
-    with pytest.raises(InputError, match=f"^modality: .*{message}"):
-        binary_images(np.asarray(modality), (2, 3))
-
-
-def test_a_label_without_a_name_is_refused():
-    with pytest.raises(InputError, match=r"names: .*KeyError\(5\)"):
-        binary_images(np.full((2, 3), 5), (2, 3), {0: "wall"})
-
-
 # --- boxes --------------------------------------------------------------------------------------------------------
 
 
@@ -145,6 +108,40 @@ def test_boxes_are_filled_between_their_corners(tmp_path):
     assert images.labels == ("chair", "plant") and images.scores.tolist() == [0.75, 0.5]
     assert np.argwhere(chair).tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
     assert np.argwhere(plant).tolist() == [[3, 0]]
+    with pytest.raises(InputError, match=r"expected box 0 within 1 x 3 pixels, found 1, 0, 3, 2"):
+        boxes.images((3, 1))  # they belong to a larger photograph
+
+
+@pytest.mark.parametrize(
+    ("values", "form", "size"),
+    [
+        ([[10, 20, 30, 60]], "xyxy", None),
+        ([[10, 20, 20, 40]], "xywh", None),
+        ([[20, 40, 20, 40]], "cxcywh", None),
+        ([[0.1, 0.25, 0.3, 0.75]], "xyxy", (80, 100)),
+        ([[0.1, 0.25, 0.2, 0.5]], "xywh", (80, 100)),
+        (torch.tensor([[0.2, 0.5, 0.2, 0.5]], requires_grad=True), "cxcywh", (80, 100)),
+    ],
+)
+def test_boxes_in_other_formats_are_the_same_boxes(values, form, size):
+    boxes = Boxes.of(values, ["chair"], form=form, size=size)
+    np.testing.assert_allclose(boxes.corners, [[10, 20, 30, 60]], rtol=1e-6)
+    assert boxes.scores.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Boxes([[0.1, 0.2, 0.5, 0.9]], ["a"], [1]), r"expected corners in pixels, .*size=\(height, width\)"),
+        (lambda: Boxes([[50, 60, 20, 10]], ["a"], [1]), r"found 50, 60, 20, 10; for x, y, width, height .*xywh"),
+        (lambda: Boxes.of([[1, 2, 3, 4]], ["a"], form="yxyx"), "form: expected xyxy, xywh or cxcywh, found 'yxyx'"),
+        (lambda: Boxes.of([[1, 2, 3, 4]], ["a"], size=(9, 9)), "expected fractions of the image, found up to 4"),
+        (lambda: Boxes.of([1, 2, 3, 4], ["a"]), r"expected numbers \(N, 4\), found int64 \(4,\)"),
+    ],
+)
+def test_boxes_in_a_format_that_was_not_said_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
 
 
 @pytest.mark.parametrize(
@@ -242,13 +239,48 @@ def test_vectors_are_on_a_grid_where_something_moves():
     [
         (np.zeros((4, 4)), r"expected floating point \(H, W, 2\), found float64 \(4, 4\)"),
         (np.zeros((4, 4, 2), int), r"found int64"),
-        (np.full((4, 4, 2), np.nan), r"NaN"),
-        (np.zeros((4, 4, 2)), r"expected a vector of 1 px at least, found none"),
+        (np.zeros((2, 4, 5), np.float32), r"found float32 \(2, 4, 5\): move the components last"),
+        (np.full((4, 4, 2), np.nan), r"expected a vector of 1 px at least, found none; 0% of the vectors are known"),
+        (np.zeros((4, 4, 2)), r"expected a vector of 1 px at least, found none; 100%"),
     ],
 )
 def test_fields_without_flow_are_refused(field, message):
     with pytest.raises(InputError, match=f"flow: .*{message}"):
         Flow.of(field)
+
+
+@pytest.mark.parametrize("unknown", [1e10, -1.6e9, np.nan, np.inf])
+def test_no_vector_starts_where_flow_is_unknown(unknown):
+    field = np.zeros((48, 48, 2), np.float32)
+    field[10:30, 10:30] = (4, -3)
+    known = Flow.of(field)
+    field[:20, :, 0] = unknown
+    flow = Flow.of(field)
+    assert 0 < len(flow.start_px) < len(known.start_px)
+    np.testing.assert_array_equal(flow.start_px, known.start_px[known.start_px[:, 1] > 20])
+
+
+def test_a_flo_file_is_read_as_middlebury_wrote_it(tmp_path):
+    field = np.random.default_rng(0).normal(0, 9, (5, 7, 2)).astype("<f4")
+    field[0] = 1.7e9
+    path = tmp_path / "a.flo"
+    whole = struct.pack("<fii", 202021.25, 7, 5) + field.tobytes()
+    path.write_bytes(whole)
+    np.testing.assert_array_equal(read_flo(path), field)
+    np.testing.assert_array_equal(Flow.read(path, spacing_px=1).start_px, Flow.of(field, spacing_px=1).start_px)
+    for content, message in (
+        (whole[:-1], "expected 12 bytes and 8 per pixel, found 7 x 5 pixels in 291 bytes"),
+        (whole + b"x", "in 293 bytes"),
+        (struct.pack("<fii", 202021.25, -7, -5) + field.tobytes(), "found -7 x -5 pixels"),
+        (struct.pack(">fii", 202021.25, 7, 5) + field.tobytes(), "starts with b'PIEH', found b'HEIP'"),
+        (b"\x89PNG\r\n", r"decode it yourself and say Flow.of"),
+        (b"PIEH\1", "found 1 x 0 pixels in 5 bytes"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=f"a.flo: .*{message}"):
+            Flow.read(path)
+    with pytest.raises(InputError, match=r"none\.flo: expected a \.flo file, found: No such file"):
+        Flow.read(tmp_path / "none.flo")
 
 
 # --- maps ---------------------------------------------------------------------------------------------------------
@@ -267,7 +299,12 @@ def test_a_map_knows_its_metres(tmp_path):
     assert bev.centres_m[0] == pytest.approx([0.25 + 0.1875 / 15, 3.75 - 0.1875 / 15])
     assert bev.centres_m[1] == pytest.approx([-2.4375, 0.0625])  # seen although no map shows it
     assert np.isnan(bev.centres_m[2]).all()
-    bev.save(tmp_path / "map.npz")
+    bev.save(str(tmp_path / "map"))  # the suffix is added
+    assert [path.name for path in tmp_path.iterdir()] == ["map.npz"]
+    for name in ("map.png", "map.npz/map", ""):
+        with pytest.raises(InputError, match=r"expected a (name that ends in \.npz|file that can be written)"):
+            bev.save(tmp_path / name if name else "")
+    assert [path.name for path in tmp_path.iterdir()] == ["map.npz"]
     with np.load(tmp_path / "map.npz") as file:
         np.testing.assert_array_equal(file["maps"], bev.maps)
         assert file["maps"].sum() == 15 and file["labels"].tolist() == ["a", "b", "c"]

@@ -1,9 +1,9 @@
 """`zerobev.load().project`: against the networks it wraps, against a closed form, and as a command."""
 
+import argparse
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +12,15 @@ from PIL import Image
 from safetensors import safe_open
 
 import zerobev
-from zerobev import cli
 from zerobev.common.errors import InputError
 from zerobev.config import SCALES, CameraConfig
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.release import SCALE, halve, released_runs
 from zerobev.experiments.workspace import Workspace
 from zerobev.geometry.projection import inverse_project
-from zerobev.inference.images import LEVELS
-from zerobev.inference.project import read_image, read_labels, read_mask
+from zerobev.inference.modality import BinaryImages
+from zerobev.inference.probabilities import LEVELS
+from zerobev.inference.project import add_arguments, run
 from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS, run_of, shipped
 from zerobev.models import build, load_model
 from zerobev.models.depth import DepthNet
@@ -184,7 +184,7 @@ def test_boxes_come_back_with_label_and_score_where_they_are(rgb):
 def test_an_arrow_leads_from_the_disc_at_its_start_to_that_at_its_end(rgb):
     field = np.zeros((SIDE, SIDE, 2), np.float32)
     field[30:34, 10:13] = (30, 0)
-    arrows = flat(2.0).project(rgb, field)
+    arrows = flat(2.0).project(rgb, zerobev.Flow.of(field))
     moved_m = 30 / CAMERA.focal_px * 2
     vector = arrows.end_m - arrows.start_m
     assert len(vector) == 1 and vector[0] == pytest.approx([moved_m, 0], abs=0.13)
@@ -192,6 +192,74 @@ def test_an_arrow_leads_from_the_disc_at_its_start_to_that_at_its_end(rgb):
     nearer = zerobev.Projector("a.2", CAMERA, None, lambda rgb: torch.full((1, 1, SIDE, SIDE), 1 + float(rgb.max())))
     flow = zerobev.Flow.of(field, after=np.zeros_like(rgb))  # the second frame is dark: its depth is 1 m
     assert nearer.project(rgb / 255 / (200 / 255), flow).end_m[0, 1] == pytest.approx(1.0625)
+
+
+def test_the_kind_decides_the_result(models, rgb, masks, tmp_path):
+    """An own kind needs no more than the two methods; files serve as photographs."""
+
+    class Column:
+        def layers(self, shape):
+            images = np.zeros((1, *shape), bool)
+            images[0, :, 30] = True
+            return (BinaryImages(("column",), images),)
+
+        def result(self, maps):
+            return zerobev.BevArrows(maps[0], maps[0])
+
+    arrows = flat(2.0).project(rgb, Column())
+    np.testing.assert_array_equal(arrows.start_m, arrows.end_m)
+    Image.fromarray(rgb).save(tmp_path / "photo.png")
+    expected = models["a.2"].project(rgb, masks).values
+    for photograph in (tmp_path / "photo.png", (tmp_path / "photo.png").read_bytes(), Image.fromarray(rgb)):
+        np.testing.assert_array_equal(models["a.2"].project(photograph, masks).values, expected)
+    bev = models["a.2"].project(rgb, zerobev.Masks(masks.astype(np.uint8) * 255), names=["x", "y", "z"])
+    np.testing.assert_array_equal(bev.values, expected)
+    assert bev.labels == ("x", "y", "z")
+    with pytest.raises(InputError, match="names: expected none beside Boxes, which has its own"):
+        models["a.2"].project(rgb, zerobev.Boxes([[1, 2, 30, 40]], ["a"], [1]), names=["b"])
+
+
+class Coarse:
+    """Estimates the brightness of what it sees, in metres, and keeps it."""
+
+    side_px = 256
+
+    def __init__(self, factor: float = 5.0):
+        self.factor, self.seen = factor, []
+
+    def __call__(self, rgb: torch.Tensor) -> torch.Tensor:
+        self.seen.append(rgb)
+        return rgb.mean(dim=1, keepdim=True) * self.factor
+
+
+@pytest.mark.parametrize(("side", "hfov", "seen"), [(1000, 79, 256), (150, 79, 150), (64, 79, 64), (40, 79, 64)])
+def test_an_estimator_sees_the_photograph_at_its_own_size_up_to_the_photograph_s(side, hfov, seen):
+    estimator = Coarse()
+    row, column = np.mgrid[:side, :side] / side
+    photograph = np.stack([0.2 + 0.3 * row, 0.2 + 0.3 * column, 0.4 + 0 * row], axis=-1)
+    depth = zerobev.Projector("a.2", CAMERA, None, estimator).depth(photograph, hfov)
+    assert estimator.seen[0].shape == (1, 3, seen, seen)
+    grid = (np.mgrid[:SIDE, :SIDE] + 0.5) / SIDE
+    np.testing.assert_allclose(depth, (0.8 + 0.3 * grid.sum(axis=0)) / 3 * 5, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "message"),
+    [
+        (lambda rgb: torch.full((1, 1, SIDE, SIDE), 2300.0), "expected depth in metres, found a median of 2300"),
+        (lambda rgb: torch.full((1, 1, SIDE, SIDE), -1.0), "expected finite depth from 0 up"),
+        (lambda rgb: torch.full((1, 1, SIDE, SIDE), float("nan")), "expected finite depth from 0 up"),
+        (lambda rgb: torch.ones(1, SIDE, SIDE), r"expected depth \(1, 1, 64, 64\), found \(1, 64, 64\)"),
+    ],
+)
+def test_depth_that_is_not_in_metres_is_refused(estimate, message, rgb):
+    with pytest.raises(InputError, match=f"estimator: {message}"):
+        zerobev.Projector("a.2", CAMERA, None, estimate).project(rgb, np.ones((SIDE, SIDE), bool))
+
+
+def test_a_network_on_another_device_is_refused():
+    with pytest.raises(InputError, match=r"estimator: expected on the CPU, found on meta: move it by .to\('cpu'\)"):
+        zerobev.Projector("a.2", CAMERA, None, torch.nn.Linear(1, 1, device="meta"))
 
 
 def test_depth_is_zero_where_the_photograph_covers_nothing(models, rgb):
@@ -220,6 +288,8 @@ def test_masks_of_another_size_and_no_boxes_are_refused(rgb):
         flat(1.0).project(rgb, np.ones((32, 32), bool))
     with pytest.raises(InputError, match="modality: expected an array, found list"):
         flat(1.0).project(rgb, [[True], [True, False]])
+    with pytest.raises(InputError, match=r"found \(32, 32\): resize it to the photograph, by nearest neighbour"):
+        flat(1.0).project(rgb, zerobev.Masks(np.ones((32, 32), bool)))
     with pytest.raises(InputError, match="at least one box"):
         flat(1.0).project(rgb, zerobev.Boxes(np.zeros((0, 4)), (), np.zeros(0)))
 
@@ -228,10 +298,12 @@ def test_masks_of_another_size_and_no_boxes_are_refused(rgb):
 
 
 def command(*arguments: object) -> None:
-    cli.main(["project", *map(str, arguments)])
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    run(parser.parse_args(list(map(str, arguments))))
 
 
-def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, capsys):
     photo, floor, thing, out = (tmp_path / name for name in ("photo.png", "floor.png", "thing.png", "map.png"))
     Image.fromarray(rgb).save(photo)
     for path, mask in ((floor, masks[0]), (thing, masks[1])):
@@ -249,30 +321,33 @@ def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, m
     command(photo, "--boxes", tmp_path / "boxes.csv", "--out", out, "--row", "a.2")
     assert "0.8" in capsys.readouterr().out
 
+    labels = np.where(masks[1], 255, np.where(masks[0], 1, 0)).astype(np.uint8)
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    for ignore, expected in (("255", ["0", "1"]), ("none", ["0", "1", "255"])):
+        command(photo, "--labels", tmp_path / "labels.png", "--ignore", ignore, "--out", out, "--row", "a.2")
+        with np.load(out.with_suffix(".npz")) as file:
+            assert file["labels"].tolist() == expected
 
-def test_the_command_says_what_is_wrong(rgb, tmp_path, monkeypatch):
-    photo, text = tmp_path / "photo.png", tmp_path / "text.png"
+
+def test_the_command_says_what_is_wrong(rgb, tmp_path):
+    photo, text, voc, small = (tmp_path / f"{name}.png" for name in ("photo", "text", "voc", "small"))
+    Image.fromarray(np.array([[0, 7, 255]] * 3, np.uint8)).save(voc)
+    Image.new("1", (4, 4)).save(small)
     Image.fromarray(rgb).save(photo)
     text.write_text("no image")
     for arguments, message in (
         ((text, "--masks", photo, "--out", tmp_path / "a.png"), "text.png: expected an image"),
         ((photo, "--labels", photo, "--out", tmp_path / "a.png"), "expected a label map of one channel"),
+        ((photo, "--labels", voc, "--out", tmp_path / "a.png"), "expected a choice for label 255, .*--ignore none"),
+        ((photo, "--labels", voc, "--ignore", "x", "--out", tmp_path / "a.png"), "--ignore: expected a label or none"),
+        ((photo, "--masks", photo, "--ignore", "0", "--out", tmp_path / "a.png"), "--ignore: expected beside --labels"),
+        (
+            (photo, "--masks", small, "--out", tmp_path / "a.png"),
+            "small.png: expected the photograph's size",
+        ),
         ((photo, "--masks", photo, "--out", tmp_path / "a.jpg"), "ends in .png"),
         ((tmp_path / "none.png", "--masks", photo, "--out", tmp_path / "a.png"), "none.png: expected an image"),
     ):
-        with pytest.raises(SystemExit, match=message):
+        with pytest.raises(InputError, match=message):
             command(*arguments)
     assert not (tmp_path / "a.png").exists()
-
-
-def test_images_are_read_as_they_are_meant(tmp_path: Path):
-    upright = np.zeros((6, 8, 3), np.uint8)
-    exif = Image.Exif()
-    exif[0x0112] = 6  # the camera was turned by 90 degrees
-    Image.fromarray(upright).save(tmp_path / "turned.jpg", exif=exif)
-    assert read_image(tmp_path / "turned.jpg").shape == (8, 6, 3)
-    palette = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(6, 8) % 3, "P")
-    palette.putpalette([0, 0, 0, 255, 0, 0, 0, 255, 0])
-    palette.save(tmp_path / "labels.png")
-    assert np.unique(read_labels(tmp_path / "labels.png")).tolist() == [0, 1, 2]
-    assert read_mask(tmp_path / "labels.png").sum() == 32

@@ -3,24 +3,37 @@
 import json
 import re
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 from transformers import (
+    BeitConfig,
     BitConfig,
     DepthAnythingConfig,
     DepthAnythingForDepthEstimation,
+    DepthProConfig,
+    DepthProForDepthEstimation,
     Dinov2Config,
     DPTConfig,
     DPTForDepthEstimation,
+    GLPNConfig,
+    GLPNForDepthEstimation,
+    PreTrainedModel,
+    PromptDepthAnythingConfig,
+    PromptDepthAnythingForDepthEstimation,
+    ZoeDepthConfig,
+    ZoeDepthForDepthEstimation,
 )
 
 from zerobev.common.errors import InputError
 from zerobev.config import SCALES, TrainConfig
 from zerobev.data.samples import ViewSet, as_float
 from zerobev.data.views import View
+from zerobev.inference import Projector
+from zerobev.inference.pinhole import PinholeView
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
 from zerobev.models.backbone_weights import load_backbone
 from zerobev.models.depth import FARTHEST_M, DepthNet, HubDepth
@@ -258,6 +271,63 @@ def dpt_hybrid() -> DPTForDepthEstimation:
     )
 
 
+def glpn() -> GLPNForDepthEstimation:
+    sizes = {"hidden_sizes": [8, 8, 16, 16], "depths": [1] * 4, "num_attention_heads": [1] * 4}
+    return GLPNForDepthEstimation(GLPNConfig(**sizes, decoder_hidden_size=8, max_depth=10))
+
+
+def zoedepth() -> ZoeDepthForDepthEstimation:
+    backbone = BeitConfig(
+        image_size=64,
+        patch_size=16,
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        intermediate_size=32,
+        out_features=["stage1", "stage2", "stage3", "stage4"],
+        reshape_hidden_states=False,
+        use_relative_position_bias=True,
+    )
+    return ZoeDepthForDepthEstimation(
+        ZoeDepthConfig(
+            backbone_config=backbone,
+            neck_hidden_sizes=[8, 8, 16, 16],
+            fusion_hidden_size=16,
+            bottleneck_features=16,
+            num_relative_features=8,
+            bin_embedding_dim=8,
+            num_attractors=[2, 2, 2, 1],
+            bin_configurations=[{"n_bins": 8, "min_depth": 0.001, "max_depth": 10.0}],
+        )
+    )
+
+
+def depth_pro() -> DepthProForDepthEstimation:
+    tiny = {"model_type": "dinov2", "image_size": 32, "patch_size": 16, "hidden_size": 16, "num_hidden_layers": 2}
+    tiny |= {"num_attention_heads": 2, "mlp_ratio": 2}
+    models = {f"{name}_model_config": dict(tiny) for name in ("image", "patch", "fov")}
+    sizes = {"intermediate_hook_ids": [1, 0], "intermediate_feature_dims": [8, 8], "fusion_hidden_size": 8}
+    config = DepthProConfig(
+        patch_size=32, scaled_images_feature_dims=[8, 8, 8], num_fov_head_layers=1, **sizes, **models
+    )
+    return DepthProForDepthEstimation(config)
+
+
+def prompt_depth_anything() -> PromptDepthAnythingForDepthEstimation:
+    given = depth_anything().config
+    sizes = {"neck_hidden_sizes": [8, 8, 16, 16], "fusion_hidden_size": 8, "head_hidden_size": 8}
+    config = PromptDepthAnythingConfig(
+        backbone_config=given.backbone_config, reassemble_hidden_size=16, depth_estimation_type="metric", **sizes
+    )
+    return PromptDepthAnythingForDepthEstimation(config)
+
+
+def loaded(network: PreTrainedModel, folder: Path) -> HubDepth:
+    """The network after a round trip through a folder; a DPT with the word that it predicts metres."""
+    network.save_pretrained(folder)
+    return HubDepth.from_pretrained(folder, predicts_metres=network.config.model_type == "dpt")
+
+
 def seen_by(estimator: HubDepth) -> list[torch.Tensor]:
     """What the network inside is given, call by call."""
     seen: list[torch.Tensor] = []
@@ -269,12 +339,21 @@ def seen_by(estimator: HubDepth) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize(
     ("make", "side", "inner"),
-    [(depth_anything, 32, 42), (depth_anything, 42, 42), (dpt, 64, 64), (dpt, 60, 64), (dpt_hybrid, 48, 64)],
+    [
+        (depth_anything, 32, 42),
+        (depth_anything, 42, 42),
+        (depth_anything, 300, 42),
+        (dpt, 64, 64),
+        (dpt, 32, 64),
+        (dpt_hybrid, 48, 64),
+        (glpn, 64, 480),
+        (zoedepth, 48, 64),
+    ],
 )
 def test_a_folder_becomes_an_estimator_of_any_image_size(make, side, inner, tmp_path):
     network = make().eval()
-    network.save_pretrained(tmp_path)
-    estimator = HubDepth.from_pretrained(tmp_path)
+    estimator = loaded(network, tmp_path)
+    assert estimator.side_px == inner
     seen = seen_by(estimator)
     rgb = torch.rand(2, 3, side, side)
     with torch.no_grad():
@@ -288,18 +367,46 @@ def test_a_folder_becomes_an_estimator_of_any_image_size(make, side, inner, tmp_
         torch.testing.assert_close(depth[:, 0], direct)
 
 
+@pytest.mark.parametrize(("make", "farthest_m"), [(depth_anything, 20), (glpn, 10), (zoedepth, 10)])
+def test_metric_types_predict_metres_up_to_the_largest_of_their_configuration(make, farthest_m):
+    estimator = HubDepth(make()).eval()
+    with torch.no_grad():
+        depth = estimator(torch.rand(1, 3, 64, 64))
+    assert depth.min() > 0 and depth.max() <= farthest_m
+
+
+def test_a_projector_gives_such_a_model_the_photograph_at_its_own_size():
+    estimator = HubDepth(depth_anything())
+    seen = seen_by(estimator)
+    fine = replace(SMOKE.camera, fpv_px=42)
+    photograph = np.random.default_rng(0).random((500, 500, 3))
+    depth = Projector("a.2", SMOKE.camera, None, estimator.eval()).depth(photograph)
+    assert depth.shape == (32, 32)
+    expected = torch.from_numpy(PinholeView((500, 500), 79, fine).photograph(photograph)).permute(2, 0, 1)
+    torch.testing.assert_close(seen[0][0] * estimator.std + estimator.mean, expected)
+
+
 @pytest.mark.parametrize("own", [None, ((0.5, 0.4, 0.3), (0.25, 0.5, 1.0))])
 def test_photographs_are_normalised_as_the_image_processor_does(own, tmp_path):
-    dpt().save_pretrained(tmp_path)
     if own:
         settings = {"image_processor_type": "DPTImageProcessor", "image_mean": own[0], "image_std": own[1]}
         (tmp_path / "preprocessor_config.json").write_text(json.dumps(settings))
-    estimator = HubDepth.from_pretrained(tmp_path)
+    estimator = loaded(dpt(), tmp_path)
     seen = seen_by(estimator)
     rgb = torch.rand(1, 3, 64, 64)
     estimator(rgb)
     mean, std = (torch.tensor(values).view(3, 1, 1) for values in own or (IMAGENET_MEAN, IMAGENET_STD))
     torch.testing.assert_close(seen[0], (rgb - mean) / std)
+
+
+@pytest.mark.parametrize(("make", "mean", "std"), [(glpn, 0, 1), (zoedepth, 0.5, 0.5)])
+@pytest.mark.parametrize("settings", [None, {"do_normalize": False}])
+def test_without_settings_photographs_are_normalised_as_in_training(make, mean, std, settings, tmp_path):
+    if settings:
+        (tmp_path / "preprocessor_config.json").write_text(json.dumps(settings))
+        mean, std = 0, 1
+    estimator = loaded(make(), tmp_path)
+    assert estimator.mean.unique().tolist() == [mean] and estimator.std.unique().tolist() == [std]
 
 
 @pytest.mark.parametrize("make", [depth_anything, dpt, dpt_hybrid])
@@ -317,6 +424,26 @@ def test_relative_depth_is_refused(tmp_path):
     message = f"{tmp_path}: expected a model of metric depth, found one of relative depth"
     with pytest.raises(InputError, match=re.escape(message)):
         HubDepth.from_pretrained(tmp_path)
+    dpt().save_pretrained(tmp_path)
+    with pytest.raises(InputError, match="found a DPT, relative as published: say predicts_metres=True"):
+        HubDepth.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "predicts"),
+    [
+        (depth_pro, "depth_pro", "inverse depth"),
+        (prompt_depth_anything, "prompt_depth_anything", "depth that is completed"),
+    ],
+)
+def test_types_that_do_not_predict_metres_are_refused_before_their_weights_are_read(make, kind, predicts, tmp_path):
+    network = make()
+    network.config.save_pretrained(tmp_path)
+    message = rf"\(depth_anything, dpt, glpn, zoedepth\), found {kind}, which predicts {predicts}"
+    with pytest.raises(InputError, match=re.escape(str(tmp_path)) + ": expected a model of metric depth " + message):
+        HubDepth.from_pretrained(tmp_path, predicts_metres=True)
+    with pytest.raises(InputError, match="network: expected a model of metric depth " + message):
+        HubDepth(network)
 
 
 def test_a_folder_that_lacks_a_weight_or_a_model_is_refused(tmp_path):
@@ -326,4 +453,4 @@ def test_a_folder_that_lacks_a_weight_or_a_model_is_refused(tmp_path):
     lost = "head.head.0.weight"
     network.save_pretrained(tmp_path, state_dict={k: v for k, v in network.state_dict().items() if k != lost})
     with pytest.raises(InputError, match=rf"{re.escape(str(tmp_path))}: .*{re.escape(lost)}"):
-        HubDepth.from_pretrained(tmp_path)
+        HubDepth.from_pretrained(tmp_path, predicts_metres=True)
