@@ -67,8 +67,9 @@ def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
     if sum(len(mesh.faces) for mesh in meshes) == 0:
         raise InputError(f"{path}: expected a mesh, found no triangles")
     scene = trimesh.Scene()
-    for index, mesh in enumerate(meshes):
-        scene.add_geometry(mesh, geom_name=f"{index:06d}")
+    scene.geometry.update((f"{index:06d}", mesh) for index, mesh in enumerate(meshes))
+    for name in reversed(scene.geometry):  # the order of textures in an atlas, and so the last bits of a photograph
+        scene.graph.update(frame_to=name, geometry=name)
     return header, scene
 
 
