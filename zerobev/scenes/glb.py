@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 
 from zerobev.common.errors import InputError
-from zerobev.scenes.gltf import CLAMP, Asset, Material, Surface
+from zerobev.scenes.gltf import CLAMP, REPEAT, Asset, Material, Surface
 
 #: Vertex attributes that trimesh has no place for: UV coordinates with v down, and linear colours that multiply.
 RAW_UV, TINT = "_TEXCOORD_0", "_TINT"
@@ -35,10 +35,13 @@ class Primitive:
     faces: np.ndarray  #: (F, 3) integers
     uv: np.ndarray | None = None  #: (V, 2) float32, v down
     colors: np.ndarray | None = None  #: (V, 4) uint16, linear
-    image: bytes | None = None  #: a PNG or JPEG file; written once for primitives that share the object
+    image: bytes | None = None  #: a PNG or JPEG file; written once for primitives that share it and its wrap modes
     base_color: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: linear RGBA, multiplied with the image
     unlit: bool = False
     double_sided: bool = False
+    alpha_mode: str = "OPAQUE"
+    alpha_cutoff: float = 0.5
+    wrap: tuple[int, int] = (REPEAT, REPEAT)  #: of u and of v, where the image is not sampled nearest
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
@@ -120,8 +123,8 @@ def placed_meshes(scene: trimesh.Scene) -> Iterator[tuple[trimesh.Trimesh, np.nd
 def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> None:
     """Write `primitives` as a GLB 2 file, a mesh and a node each. Same input, same bytes.
 
-    `nearest` asks for nearest, clamped sampling of the images; else the file says nothing, which is linear and
-    repeating.
+    `nearest` asks for nearest, clamped sampling of the images; else the file says no more than the wrap modes, and
+    nothing at all where they repeat.
     """
     header: dict[str, Any] = {"asset": {"version": "2.0", "generator": "zerobev"}, "scene": 0}
     for key in ("nodes", "meshes", "materials", "accessors", "bufferViews", "images", "textures"):
@@ -132,7 +135,9 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
     if any(primitive.unlit for primitive in primitives):
         header["extensionsUsed"] = ["KHR_materials_unlit"]
     binary = bytearray()
-    texture_of: dict[int, int] = {}  # by identity: charts that happen to look the same remain two
+    texture_of: dict[
+        tuple[int, tuple[int, int]], int
+    ] = {}  # by identity: charts that happen to look the same remain two
     for index, primitive in enumerate(primitives):
         attributes = {"POSITION": _add_array(header, binary, primitive.positions, _FLOAT, bounds=True)}
         if primitive.uv is not None:
@@ -143,13 +148,14 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
         triangles = {"attributes": attributes, "indices": indices, "mode": 4}
         header["meshes"].append({"name": primitive.name, "primitives": [triangles]})
         header["nodes"].append({"name": primitive.name, "mesh": index})
-        if primitive.colors is not None and primitive.image is None:
+        if primitive.colors is not None and primitive.image is None and primitive.alpha_mode == "OPAQUE":
             continue  # readers (trimesh is one) take the white of a material for the colour
         texture = None
         if primitive.image is not None:
-            if id(primitive.image) not in texture_of:
-                texture_of[id(primitive.image)] = _add_image(header, binary, primitive.image, nearest)
-            texture = texture_of[id(primitive.image)]
+            key = id(primitive.image), primitive.wrap
+            if key not in texture_of:
+                texture_of[key] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
+            texture = texture_of[key]
         triangles["material"] = len(header["materials"])
         header["materials"].append(_material(primitive, texture))
     header["buffers"] = [{"byteLength": len(binary)}]
@@ -188,6 +194,10 @@ def _material(primitive: Primitive, texture: int | None) -> dict[str, Any]:
     if texture is not None:
         surface["baseColorTexture"] = {"index": texture}
     material = {"name": primitive.name, "pbrMetallicRoughness": surface, "doubleSided": primitive.double_sided}
+    if primitive.alpha_mode != "OPAQUE":
+        material["alphaMode"] = primitive.alpha_mode
+    if primitive.alpha_mode == "MASK":
+        material["alphaCutoff"] = primitive.alpha_cutoff
     if primitive.unlit:
         material["extensions"] = {"KHR_materials_unlit": {}}
     return material
@@ -213,10 +223,15 @@ def _add_array(header: dict[str, Any], binary: bytearray, array: np.ndarray, kin
     return len(header["accessors"]) - 1
 
 
-def _add_image(header: dict[str, Any], binary: bytearray, image: bytes, nearest: bool) -> int:
-    """Index of a new texture of `image`, an encoded file."""
+def _add_image(header: dict[str, Any], binary: bytearray, image: bytes, wrap: tuple[int, int] | None) -> int:
+    """Index of a new texture of `image`, an encoded file; without `wrap` it has the sampler that stands first."""
     kind = "image/png" if image.startswith(b"\x89PNG") else "image/jpeg"
     header["images"].append({"bufferView": _add_view(header, binary, image), "mimeType": kind})
-    sampled = {"sampler": 0} if nearest else {}
-    header["textures"].append({"source": len(header["images"]) - 1} | sampled)
+    texture = {"source": len(header["images"]) - 1}
+    if wrap is None:
+        texture["sampler"] = 0
+    elif wrap != (REPEAT, REPEAT):
+        header.setdefault("samplers", []).append({"wrapS": wrap[0], "wrapT": wrap[1]})
+        texture["sampler"] = len(header["samplers"]) - 1
+    header["textures"].append(texture)
     return len(header["textures"]) - 1
