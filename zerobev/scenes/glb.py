@@ -135,9 +135,7 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
     if any(primitive.unlit for primitive in primitives):
         header["extensionsUsed"] = ["KHR_materials_unlit"]
     binary = bytearray()
-    texture_of: dict[
-        tuple[int, tuple[int, int]], int
-    ] = {}  # by identity: charts that happen to look the same remain two
+    texture_of: dict[tuple[int, tuple[int, int]], int] = {}  # by identity: equal charts remain two
     for index, primitive in enumerate(primitives):
         attributes = {"POSITION": _add_array(header, binary, primitive.positions, _FLOAT, bounds=True)}
         if primitive.uv is not None:
