@@ -58,7 +58,8 @@ def primitives(photograph: trimesh.Scene) -> tuple[list[pyrender.Primitive], lis
             part = _part(mesh)
             place = (id(part.image), part.wrap) if part.tiled else (0, (REPEAT, REPEAT))
             groups[part.double_sided, part.alpha_mode, part.alpha_cutoff, place].append(part)
-    solid, glass = [], []
+    solid: list[pyrender.Primitive] = []
+    glass: list[pyrender.Primitive] = []
     for (_, mode, *_), parts in groups.items():
         (glass if mode == "BLEND" else solid).extend(_textured_primitives(parts))
     return solid, glass
@@ -90,7 +91,7 @@ def _part(mesh: trimesh.Trimesh) -> _Textured:
     cutoff = getattr(material, "alphaCutoff", None)
     tint = _tint(mesh)
     if tint is not None and mode == "OPAQUE":
-        tint = tint * np.float32([1, 1, 1, 0]) + np.float32([0, 0, 0, 1])
+        tint = np.concatenate([tint[:, :3], np.ones((len(tint), 1), np.float32)], axis=1)
     return _Textured(
         corners=corners,
         uv=uv,

@@ -150,10 +150,10 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
             continue  # readers (trimesh is one) take the white of a material for the colour
         texture = None
         if primitive.image is not None:
-            key = id(primitive.image), primitive.wrap
-            if key not in texture_of:
-                texture_of[key] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
-            texture = texture_of[key]
+            place = id(primitive.image), primitive.wrap
+            if place not in texture_of:
+                texture_of[place] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
+            texture = texture_of[place]
         triangles["material"] = len(header["materials"])
         header["materials"].append(_material(primitive, texture))
     header["buffers"] = [{"byteLength": len(binary)}]
