@@ -65,6 +65,9 @@ def renderer() -> "pyrender.OffscreenRenderer":
     """
     try:
         made = pyrender.OffscreenRenderer(1, 1)
+        from zerobev.rendering.shaders import SurfaceRenderer  # it builds on pyrender, which may be missing
+
+        made._renderer = SurfaceRenderer(1, 1)
     except SetupError:
         raise
     except Exception as error:  # of pyrender, PyOpenGL or ctypes

@@ -1,11 +1,9 @@
-"""GLB files: what trimesh leaves out when it reads or writes them.
+"""GLB files to trimesh's scenes, and GLB files from primitives.
 
-trimesh reads geometry, node transforms and images. It drops material extensions, and it turns v upwards with a
-rounding error, so `read_glb` returns the header too and hands UV coordinates through untouched under a second
-name. Writing is our own: trimesh's exporter has no samplers, no 16-bit colours and no choice of JPEG quality.
+trimesh turns v upwards with a rounding error, so UV coordinates are also kept untouched under a second name. Writing is
+our own: trimesh's exporter has no samplers, no 16-bit colours and no choice of JPEG quality.
 """
 
-import io
 import json
 import struct
 from collections.abc import Iterator, Sequence
@@ -15,18 +13,17 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from PIL import Image
 
 from zerobev.common.errors import InputError
+from zerobev.scenes.gltf import CLAMP, REPEAT, Asset, Material, Surface
 
-#: Vertex attribute with UV coordinates as they stand in the file; trimesh leaves names with an underscore alone.
-RAW_UV = "_TEXCOORD_0"
+#: Vertex attributes that trimesh has no place for: UV coordinates with v down, and linear colours that multiply.
+RAW_UV, TINT = "_TEXCOORD_0", "_TINT"
 
 _MAGIC, _VERSION = b"glTF", 2
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
-_IMAGES = ("PNG", "JPEG")  # what glTF allows; PIL would open a PostScript file as well, and run it
-_NEAREST_CLAMPED = {"magFilter": 9728, "minFilter": 9728, "wrapS": 33071, "wrapT": 33071}
+_NEAREST_CLAMPED = {"magFilter": 9728, "minFilter": 9728, "wrapS": CLAMP, "wrapT": CLAMP}
 
 
 @dataclass(frozen=True)
@@ -38,18 +35,24 @@ class Primitive:
     faces: np.ndarray  #: (F, 3) integers
     uv: np.ndarray | None = None  #: (V, 2) float32, v down
     colors: np.ndarray | None = None  #: (V, 4) uint16, linear
-    image: bytes | None = None  #: a PNG or JPEG file; written once for primitives that share the object
+    image: bytes | None = None  #: a PNG or JPEG file; written once for primitives that share it and its wrap modes
     base_color: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: linear RGBA, multiplied with the image
     unlit: bool = False
     double_sided: bool = False
+    alpha_mode: str = "OPAQUE"
+    alpha_cutoff: float = 0.5
+    wrap: tuple[int, int] = (REPEAT, REPEAT)  #: of u and of v, where the image is not sampled nearest
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
-    """The JSON header of the GLB file at `path`, and its content as trimesh reads it.
+    """The JSON header of the GLB file at `path`, and the surfaces of its default scene, placed in the world.
 
-    Geometries are in the file's order. Their UV coordinates are also in `vertex_attributes[RAW_UV]`, v down and
-    exactly as stored. Images are opened, not decoded. A file that is missing, cut short, no GLB 2, compressed,
-    without triangles, not finite, or with images other than PNG and JPEG, is an `InputError`.
+    A mesh per primitive and node, ordered as the primitives are in the file. Besides what trimesh knows, a mesh has
+    `vertex_attributes[RAW_UV]` ((V, 2) float32, v down, texture transform applied), `vertex_attributes[TINT]`
+    ((V, 4) float32, linear: vertex colour times base colour; absent where that is white), and in its `metadata` the
+    sampler's `wrap` modes (of u, of v) and `unlit`. Images are opened, not decoded. A file that is missing, cut
+    short, no GLB 2, compressed, without triangles, not finite, that requires an extension not known here, or whose
+    base colours are neither PNG, JPEG nor WebP, is an `InputError`.
     """
     try:
         content = Path(path).read_bytes()
@@ -57,27 +60,48 @@ def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
         raise InputError(f"{path}: expected a GLB file, found {error.strerror}") from error
     header, end = _header(path, content)
     try:
-        _check_accessors(path, header)
-        _check_images(path, header, content[end + 8 :])
-        for mesh in header.get("meshes", []):
-            for primitive in mesh["primitives"]:
-                if "TEXCOORD_0" in primitive["attributes"]:
-                    primitive["attributes"][RAW_UV] = primitive["attributes"]["TEXCOORD_0"]
-        loaded = trimesh.load_scene(io.BytesIO(_container(header, content[end:])), file_type="glb", process=False)
-        meshes = list(placed_meshes(loaded))
-        complete = all(_is_complete(vertices, faces) for _, vertices, faces in meshes)
-        finite = all(np.isfinite(vertices).all() for _, vertices, _ in meshes)
+        surfaces = Asset(path, header, content[end + 8 :]).surfaces()
+        meshes = [_mesh(surface) for surface in surfaces]
     except InputError:
         raise
-    except Exception as error:  # trimesh has no error of its own for a broken file
+    except Exception as error:  # JSON of the wrong types, and what PIL raises for a broken image
         found = " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(f"{path}: expected a readable GLB file, found {found}") from error
-    if sum(len(faces) for _, _, faces in meshes) == 0:
+    if sum(len(mesh.faces) for mesh in meshes) == 0:
         raise InputError(f"{path}: expected a mesh, found no triangles")
-    if not finite or not complete:
-        found = "a vertex that is not" if not finite else "a face with a vertex that does not exist"
-        raise InputError(f"{path}: expected finite vertices and faces between them, found {found}")
-    return header, loaded
+    scene = trimesh.Scene()
+    scene.geometry.update((f"{index:06d}", mesh) for index, mesh in enumerate(meshes))
+    for name in reversed(scene.geometry):  # the order of textures in an atlas, and so the last bits of a photograph
+        scene.graph.update(frame_to=name, geometry=name)
+    return header, scene
+
+
+def _mesh(surface: Surface) -> trimesh.Trimesh:
+    """A surface as trimesh has it; the material of one without is white."""
+    material = surface.material or Material()
+    attributes, visual = {}, None
+    if surface.uv is not None:
+        attributes[RAW_UV] = surface.uv
+    tint = np.asarray(material.base_color, np.float32) * (1 if surface.colors is None else surface.colors)
+    if (tint != 1).any():
+        attributes[TINT] = np.broadcast_to(tint, (len(surface.vertices), 4))
+    if surface.material is None and surface.colors is not None:
+        colors = np.rint(255 * surface.colors).astype(np.uint8)
+        visual = trimesh.visual.ColorVisuals(vertex_colors=colors)
+    else:
+        pbr = trimesh.visual.material.PBRMaterial(
+            baseColorFactor=list(material.base_color),
+            baseColorTexture=material.image,
+            alphaMode=material.alpha_mode,
+            alphaCutoff=material.alpha_cutoff,
+            doubleSided=material.double_sided,
+        )
+        up = None if surface.uv is None else np.stack([surface.uv[:, 0], 1 - surface.uv[:, 1]], axis=1)
+        visual = trimesh.visual.TextureVisuals(uv=up, material=pbr)
+    metadata = {"wrap": material.wrap, "unlit": material.unlit}
+    return trimesh.Trimesh(
+        surface.vertices, surface.faces, visual=visual, vertex_attributes=attributes, metadata=metadata, process=False
+    )
 
 
 def placed_meshes(scene: trimesh.Scene) -> Iterator[tuple[trimesh.Trimesh, np.ndarray, np.ndarray]]:
@@ -99,8 +123,8 @@ def placed_meshes(scene: trimesh.Scene) -> Iterator[tuple[trimesh.Trimesh, np.nd
 def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> None:
     """Write `primitives` as a GLB 2 file, a mesh and a node each. Same input, same bytes.
 
-    `nearest` asks for nearest, clamped sampling of the images; else the file says nothing, which is linear and
-    repeating.
+    `nearest` asks for nearest, clamped sampling of the images; else the file says no more than the wrap modes, and
+    nothing at all where they repeat.
     """
     header: dict[str, Any] = {"asset": {"version": "2.0", "generator": "zerobev"}, "scene": 0}
     for key in ("nodes", "meshes", "materials", "accessors", "bufferViews", "images", "textures"):
@@ -111,7 +135,7 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
     if any(primitive.unlit for primitive in primitives):
         header["extensionsUsed"] = ["KHR_materials_unlit"]
     binary = bytearray()
-    texture_of: dict[int, int] = {}  # by identity: charts that happen to look the same remain two
+    texture_of: dict[tuple[int, tuple[int, int]], int] = {}  # by identity: equal charts remain two
     for index, primitive in enumerate(primitives):
         attributes = {"POSITION": _add_array(header, binary, primitive.positions, _FLOAT, bounds=True)}
         if primitive.uv is not None:
@@ -122,13 +146,14 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
         triangles = {"attributes": attributes, "indices": indices, "mode": 4}
         header["meshes"].append({"name": primitive.name, "primitives": [triangles]})
         header["nodes"].append({"name": primitive.name, "mesh": index})
-        if primitive.colors is not None and primitive.image is None:
+        if primitive.colors is not None and primitive.image is None and primitive.alpha_mode == "OPAQUE":
             continue  # readers (trimesh is one) take the white of a material for the colour
         texture = None
         if primitive.image is not None:
-            if id(primitive.image) not in texture_of:
-                texture_of[id(primitive.image)] = _add_image(header, binary, primitive.image, nearest)
-            texture = texture_of[id(primitive.image)]
+            place = id(primitive.image), primitive.wrap
+            if place not in texture_of:
+                texture_of[place] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
+            texture = texture_of[place]
         triangles["material"] = len(header["materials"])
         header["materials"].append(_material(primitive, texture))
     header["buffers"] = [{"byteLength": len(binary)}]
@@ -154,29 +179,6 @@ def _header(path: Path, content: bytes) -> tuple[dict[str, Any], int]:
     return header, 20 + size
 
 
-def _check_accessors(path: Path, header: dict[str, Any]) -> None:
-    """glTF lets an accessor have a count and no data: zeros, of which a few bytes of header would fill the memory."""
-    for index, accessor in enumerate(header.get("accessors", [])):
-        if "bufferView" not in accessor:
-            raise InputError(f"{path}: expected data that is not compressed, found none for accessor {index}")
-
-
-def _is_complete(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    return vertices.shape[1:] == (3,) and bool(np.all((faces >= 0) & (faces < len(vertices))))
-
-
-def _check_images(path: Path, header: dict[str, Any], binary: bytes) -> None:
-    """trimesh passes over an image that it cannot open; here that is an error."""
-    for index, image in enumerate(header.get("images", [])):
-        view = header["bufferViews"][image["bufferView"]]
-        start = view.get("byteOffset", 0)
-        try:
-            Image.open(io.BytesIO(binary[start : start + view["byteLength"]]), formats=_IMAGES)
-        except OSError as error:
-            kind = image.get("mimeType", "a file of no type")
-            raise InputError(f"{path}: expected a readable PNG or JPEG as image {index}, found {kind}") from error
-
-
 def _container(header: dict[str, Any], rest: bytes) -> bytes:
     """A GLB file of a JSON header and the chunks after it."""
     text = json.dumps(header, separators=(",", ":")).encode()
@@ -190,6 +192,10 @@ def _material(primitive: Primitive, texture: int | None) -> dict[str, Any]:
     if texture is not None:
         surface["baseColorTexture"] = {"index": texture}
     material = {"name": primitive.name, "pbrMetallicRoughness": surface, "doubleSided": primitive.double_sided}
+    if primitive.alpha_mode != "OPAQUE":
+        material["alphaMode"] = primitive.alpha_mode
+    if primitive.alpha_mode == "MASK":
+        material["alphaCutoff"] = primitive.alpha_cutoff
     if primitive.unlit:
         material["extensions"] = {"KHR_materials_unlit": {}}
     return material
@@ -215,10 +221,15 @@ def _add_array(header: dict[str, Any], binary: bytearray, array: np.ndarray, kin
     return len(header["accessors"]) - 1
 
 
-def _add_image(header: dict[str, Any], binary: bytearray, image: bytes, nearest: bool) -> int:
-    """Index of a new texture of `image`, an encoded file."""
+def _add_image(header: dict[str, Any], binary: bytearray, image: bytes, wrap: tuple[int, int] | None) -> int:
+    """Index of a new texture of `image`, an encoded file; without `wrap` it has the sampler that stands first."""
     kind = "image/png" if image.startswith(b"\x89PNG") else "image/jpeg"
     header["images"].append({"bufferView": _add_view(header, binary, image), "mimeType": kind})
-    sampled = {"sampler": 0} if nearest else {}
-    header["textures"].append({"source": len(header["images"]) - 1} | sampled)
+    texture = {"source": len(header["images"]) - 1}
+    if wrap is None:
+        texture["sampler"] = 0
+    elif wrap != (REPEAT, REPEAT):
+        header.setdefault("samplers", []).append({"wrapS": wrap[0], "wrapT": wrap[1]})
+        texture["sampler"] = len(header["samplers"]) - 1
+    header["textures"].append(texture)
     return len(header["textures"]) - 1

@@ -17,6 +17,7 @@ from PIL import Image
 from zerobev.common.errors import InputError
 from zerobev.config import Split, one_of
 from zerobev.scenes.categories import label_of
+from zerobev.scenes.charts import Charts
 from zerobev.scenes.extents import check_extents
 from zerobev.scenes.glb import RAW_UV, placed_meshes, read_glb
 from zerobev.scenes.scene import Instance, Scene
@@ -30,7 +31,6 @@ _ROW = re.compile(r'([0-9]{1,5}),([0-9A-Fa-f]{6}),"(.*)",(-?[0-9]{1,9})')
 _ROW_FORM = 'id,RRGGBB,"name",region'
 _LARGEST_ID = 65535
 _ROWS_SHOWN = 5  # of the bad rows of a file
-_LARGEST_SIDE = 32767  # of a texture: texels are kept as int16
 
 
 @dataclass(frozen=True)
@@ -102,23 +102,23 @@ def read_scene(folder: Path) -> Scene:
     """The scene in `folder`, named after it.
 
     Faces keep the file's order; charts are in the order of their first face. Texels whose colour belongs to no
-    instance get id 0. UV coordinates are clamped to [0, 1]. A mesh of the annotation without a texture is an
-    `InputError` (textures for the surface need the atlas), and so is every broken or missing file, and a home that is
-    not in metres with z up (`check_extents`).
+    instance get id 0; if these are more than a few per cent of the surface, it is an `InputError`. So is a mesh of the
+    annotation without a texture (textures for the surface need the atlas), every broken or missing file, and a home
+    that is not in metres with z up (`check_extents`).
     """
     folder = Path(folder)
     stem = hash_of(folder)
-    instances = read_instances(folder / f"{stem}.semantic.txt")
+    instances, bad_rows = _read_rows(folder / f"{stem}.semantic.txt")
     path = folder / f"{stem}.semantic.glb"
     _, annotation = read_glb(path)
-    atlas = _read_atlas(path, annotation, instances)
+    atlas = _read_atlas(path, annotation, instances, bad_rows)
     photograph_path = folder / f"{stem}.glb"
-    photograph_header, photograph = read_glb(photograph_path)
-    unlit = any("KHR_materials_unlit" in (m.get("extensions") or {}) for m in photograph_header.get("materials", []))
+    _, photograph = read_glb(photograph_path)
+    unlit = any(mesh.metadata["unlit"] for mesh in photograph.geometry.values())
     for mesh in photograph.geometry.values():
         image = _texture(mesh)
         if image is not None:
-            _decode(photograph_path, image)
+            _check_texture(photograph_path, image)
     scene = Scene(name=folder.name, **atlas, instances=instances, photograph=photograph, unlit=unlit)
     check_extents(scene, path, photograph_path)
     return scene
@@ -134,7 +134,11 @@ def read_instances(path: Path) -> tuple[Instance, ...]:
     their surface has id 0, "unknown". One warning on the log "zerobev.scenes" lists them. A file without a good row,
     without the first line, or that cannot be read, is an `InputError`.
     """
-    path = Path(path)
+    return _read_rows(Path(path))[0]
+
+
+def _read_rows(path: Path) -> tuple[tuple[Instance, ...], int]:
+    """As `read_instances`, with the number of rows that were left out."""
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
     except OSError as error:
@@ -165,7 +169,7 @@ def read_instances(path: Path) -> tuple[Instance, ...]:
         if not instances:
             raise InputError(message)
         log.warning("%s: their surfaces are unknown", message)
-    return tuple(instances[key] for key in sorted(instances))
+    return tuple(instances[key] for key in sorted(instances)), len(bad)
 
 
 def _instance(row: str) -> Instance | None:
@@ -183,59 +187,36 @@ def _is_annotated(folder: Path) -> bool:
     return all((folder / f"{stem}.semantic.{kind}").is_file() for kind in ("glb", "txt"))
 
 
-def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance, ...]) -> dict:
+def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance, ...], bad_rows: int) -> dict:
     """The fields of a `Scene` that come from the annotation's mesh and textures."""
     id_of_color = np.zeros(1 << 24, np.uint16)
     for instance in instances:
         red, green, blue = instance.color
         id_of_color[red | green << 8 | blue << 16] = instance.id
-    vertices, faces, face_uv, face_chart, double_sided = [], [], [], [], []
-    charts: list[np.ndarray] = []
-    chart_of_image: dict[int, int] = {}
+    charts = Charts(path, id_of_color, bad_rows)
+    vertices, faces, double_sided = [], [], []
     count = 0
     for mesh, positions, triangles in placed_meshes(annotation):
         image = _texture(mesh)
         raw_uv = mesh.vertex_attributes.get(RAW_UV)
         if image is None or raw_uv is None:
             raise InputError(f"{path}: expected a texture and UV coordinates on every mesh, found one without")
-        uv = np.asarray(raw_uv)
-        if uv.shape != (len(positions), 2):
-            raise InputError(f"{path}: expected UV coordinates ({len(positions)}, 2), found {uv.shape}")
-        if not np.isfinite(uv).all():
-            raise InputError(f"{path}: expected finite UV coordinates, found one that is not")
-        if id(image) not in chart_of_image:
-            chart_of_image[id(image)] = len(charts)
-            charts.append(id_of_color[_color_codes(_decode(path, image, "RGBA"))])
-            if max(charts[-1].shape) > _LARGEST_SIDE:
-                raise InputError(f"{path}: expected at most {_LARGEST_SIDE} texels a side, found {charts[-1].shape}")
         vertices.append(positions)
         faces.append((triangles + count).astype(np.int32))
-        face_uv.append(np.clip(uv, 0, 1).astype(np.float32)[triangles])
-        face_chart.append(np.full(len(triangles), chart_of_image[id(image)], np.int16))
+        charts.add(image, mesh.metadata["wrap"], np.asarray(raw_uv, np.float32)[triangles])
         double_sided.append(np.full(len(triangles), bool(mesh.visual.material.doubleSided)))
         count += len(positions)
-    return {
-        "vertices": np.concatenate(vertices),
-        "faces": np.concatenate(faces),
-        "face_uv": np.concatenate(face_uv),
-        "face_chart": np.concatenate(face_chart),
-        "chart_instance": tuple(charts),
-        "double_sided": np.concatenate(double_sided),
-    }
+    world, corners = np.concatenate(vertices), np.concatenate(faces)
+    sided = np.concatenate(double_sided)
+    return {"vertices": world, "faces": corners, "double_sided": sided, **charts.build(world[corners])}
 
 
 def _texture(mesh: trimesh.Geometry) -> Image.Image | None:
     return getattr(getattr(getattr(mesh, "visual", None), "material", None), "baseColorTexture", None)
 
 
-def _decode(path: Path, image: Image.Image, mode: str | None = None) -> Image.Image:
+def _check_texture(path: Path, image: Image.Image) -> None:
     try:
         image.load()
-        return image if mode is None else image.convert(mode)
     except Exception as error:  # PIL raises OSError, SyntaxError, ValueError, ... for a broken image
         raise InputError(f"{path}: expected readable textures, found one that is not: {error}") from error
-
-
-def _color_codes(image: Image.Image) -> np.ndarray:
-    """RGBA -> (rows, columns) uint32: red, green and blue bytes as one number, red lowest."""
-    return np.asarray(image).view("<u4")[..., 0] & 0xFFFFFF

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,7 +14,8 @@ from PIL import Image
 
 from zerobev.common.errors import InputError
 from zerobev.common.storage import write_json
-from zerobev.scenes.glb import Primitive, placed_meshes, write_glb
+from zerobev.scenes.glb import TINT, Primitive, placed_meshes, write_glb
+from zerobev.scenes.gltf import REPEAT, rgba
 from zerobev.scenes.hm3dsem import FIRST_LINE, hash_of
 from zerobev.scenes.scene import Instance, Scene
 
@@ -127,12 +129,19 @@ def _photograph_primitives(scene: Scene) -> Iterator[Primitive]:
     encoded: dict[int, bytes] = {}
     for index, (mesh, positions, faces) in enumerate(placed_meshes(scene.photograph)):
         uv, colors, image, double_sided = None, None, None, bool(np.any(scene.double_sided))
+        alpha: dict[str, Any] = {}
         factor: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
         if mesh.visual.kind == "texture":
             material = mesh.visual.material
             material = material.to_pbr() if isinstance(material, trimesh.visual.material.SimpleMaterial) else material
             image, double_sided = material.baseColorTexture, double_sided or bool(material.doubleSided)
-            if material.baseColorFactor is not None:
+            alpha = {"alpha_mode": material.alphaMode or "OPAQUE", "alpha_cutoff": material.alphaCutoff or 0.0}
+            tint = mesh.vertex_attributes.get(TINT)
+            if tint is not None and (tint == tint[0]).all():
+                factor = tuple(float(c) for c in tint[0])
+            elif tint is not None:
+                colors = np.rint(65535 * tint).astype(np.uint16)
+            elif material.baseColorFactor is not None:
                 factor = tuple(float(c) for c in trimesh.visual.color.to_float(material.baseColorFactor))
             if mesh.visual.uv is not None:
                 uv = np.array([0, 1]) + np.asarray(mesh.visual.uv)[:, :2] * np.array([1, -1])  # v up to v down
@@ -150,13 +159,15 @@ def _photograph_primitives(scene: Scene) -> Iterator[Primitive]:
             base_color=factor,
             unlit=scene.unlit,
             double_sided=double_sided,
+            wrap=mesh.metadata.get("wrap", (REPEAT, REPEAT)),
+            **alpha,
         )
 
 
 def _encoded_photograph(image: Image.Image) -> bytes:
     if image.has_transparency_data:
         return _encoded(image, "PNG", compress_level=1)
-    return _encoded(image.convert("RGB"), "JPEG", quality=_JPEG_QUALITY)
+    return _encoded(Image.fromarray(rgba(image)[..., :3]), "JPEG", quality=_JPEG_QUALITY)
 
 
 def _encoded(image: Image.Image, kind: str, **options: int) -> bytes:

@@ -36,7 +36,7 @@ class Scene:
     name: str
     vertices: np.ndarray  #: (V, 3) float32, metres
     faces: np.ndarray  #: (F, 3) int32
-    face_uv: np.ndarray  #: (F, 3, 2) float32, u right and v down, in [0, 1], of each corner of a face
+    face_uv: np.ndarray  #: (F, 3, 2) float32, u right and v down, of each corner of a face; clamped to [0, 1] per point
     face_chart: np.ndarray  #: (F,) int16, index into `chart_instance`
     chart_instance: tuple[np.ndarray, ...]  #: one (rows, columns) uint16 image a chart: instance id of each texel
     instances: tuple[Instance, ...]  #: sorted by id

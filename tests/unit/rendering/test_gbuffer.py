@@ -15,7 +15,7 @@ from trimesh.visual.texture import TextureVisuals
 from zerobev.config import AgentConfig, CameraConfig
 from zerobev.geometry.cameras import Pose, bev_cell_centres, fpv_rays
 from zerobev.geometry.projection import map_points
-from zerobev.rendering import photograph
+from zerobev.rendering import surfaces
 from zerobev.rendering.gbuffer import GBuffer, RayCaster
 from zerobev.rendering.photograph import Photographer
 from zerobev.rendering.poses import navigable_floor
@@ -281,7 +281,7 @@ EASEL = Pose(0, 0, 0, 0)
 @pytest.mark.parametrize("atlas_px", [8192, 24, 8])
 def test_each_texture_is_where_it_belongs(atlas_px, monkeypatch):
     """Images of any width, in one atlas or several, once or repeated, keep their colours and places."""
-    monkeypatch.setattr(photograph, "_ATLAS_PX", atlas_px)
+    monkeypatch.setattr(surfaces, "_ATLAS_PX", atlas_px)
     rng = np.random.default_rng(0)
     colors = rng.integers(0, 256, (4, 4, 3))
     places = [(-1.6, 10, 10, 1), (-0.8, 14, 6, 1), (0, 6, 18, 2), (0.8, 22, 10, 1)]
@@ -317,6 +317,6 @@ def test_photographers_of_two_scenes_and_sizes_take_turns():
 
 def test_photographs_need_no_window_and_no_python_before_3_12():
     """What pyrender and the PyOpenGL that it pins would do by themselves fails on a bare Debian and on Python 3.12."""
-    assert photograph.pyrender.viewer.pyglet.options.headless
+    assert surfaces.pyrender.viewer.pyglet.options.headless
     renamed = type("CArgObject", (), {"__module__": "_ctypes"})  # as Python 3.12 calls what `ctypes.byref` gives
     assert FormatHandler.match(renamed) is not None

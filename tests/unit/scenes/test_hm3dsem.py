@@ -171,10 +171,11 @@ def test_a_vertex_of_two_instances_has_two_colors(scene: Scene, tmp_path: Path) 
         np.testing.assert_array_equal(corners, [color[owner]] * 3)
 
 
-def test_uv_is_clamped(scene: Scene, tmp_path: Path) -> None:
+def test_uv_beyond_a_clamped_texture_is_kept(scene: Scene, tmp_path: Path) -> None:
+    """Clamping is per point: a corner that is clamped would stretch the texture over its face."""
     wide = scene.face_uv * 3 - np.float32(1)
     write_scene(tmp_path / scene.name, dataclasses.replace(scene, face_uv=wide))
-    np.testing.assert_array_equal(read_scene(tmp_path / scene.name).face_uv, np.clip(wide, 0, 1))
+    np.testing.assert_array_equal(read_scene(tmp_path / scene.name).face_uv, wide)
 
 
 def test_charts_that_look_the_same_remain_two(scene: Scene, tmp_path: Path) -> None:
@@ -282,7 +283,7 @@ EDITS = {
         "TEXCOORD_0"
     ),
     "KeyError": lambda header, _: header["accessors"][0].pop("count"),
-    "readable": lambda header, _: header["accessors"][0].update(count=10**6),
+    "rows of 3 numbers": lambda header, _: header["accessors"][0].update(count=10**6),
 }
 
 
@@ -346,8 +347,7 @@ def test_any_damage_is_read_or_named(scene: Scene, tmp_path: Path, data: st.Data
         assert str(path.name) in str(error)
         assert "\n" not in str(error)
     else:
-        assert back.face_uv.min() >= 0
-        assert back.face_uv.max() <= 1
+        assert np.isfinite(back.face_uv).all()
         assert len(back.face_instance) == len(back.faces)
 
 
