@@ -1,8 +1,10 @@
-"""What every test shares: no display, no window, no chance."""
+"""Settings that all tests share."""
 
 import os
 
 import hypothesis
+
+import zerobev  # noqa: F401  # before a test loads torch: it tells OpenMP's threads not to spin
 
 os.environ.setdefault("MPLBACKEND", "agg")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
