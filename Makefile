@@ -24,10 +24,10 @@ export TOKENIZERS_PARALLELISM ?= false
 # Packages come from .venv alone.
 unexport PYTHONHOME PYTHONPATH
 
-.PHONY: help setup reproduce test pytest nbval coverage lab notebooks clean distclean
+.PHONY: help setup reproduce check test unit fast integration static integrity nbval coverage lab notebooks clean distclean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
 
 # With FRESH=1 every run is computed anyway; otherwise one record is held against a run of today.
 # With PLAN=1 it is only told what the run takes; at the paper's scale it is told first, and refused where it cannot be.
@@ -45,18 +45,32 @@ reproduce: setup ## run the workbook [SCALE=smoke|reduced|paper SCENES=dir TEXTU
 	[ -n "$$fresh" ] || $(PYTHON) -m zerobev spot-check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${SPOT:+--row "$$SPOT"}
 
-# Both at once: most of either computes on one core. What the notebooks say is printed whole, when they are through.
-test: setup ## run the tests, and check every notebook against its committed outputs
-	@$(MAKE) --jobs=2 --keep-going pytest nbval
+# Two parts at a time, the longest first: most of them compute on one core. What a part says is printed whole at its end.
+PARTS := $(MAKE) --jobs=2 --keep-going --output-sync=target
 
-pytest: setup ## run the tests alone
-	@$(PYTHON) -m pytest tests
+test: setup ## run all tests, and check every notebook against its committed outputs
+	@$(PARTS) unit integration nbval integrity
+
+check: setup ## the fast loop, under 3 min: style, types, layers, and the unit tests that are not slow
+	@$(PARTS) fast static
+
+unit: setup ## the unit tests alone
+	@$(PYTHON) -m pytest tests/unit
+
+fast: setup ## the unit tests that are not slow
+	@$(PYTHON) -m pytest tests/unit -m "not slow"
+
+integration: setup ## the tests of several parts at work together
+	@$(PYTHON) -m pytest tests/integration
+
+static: setup ## style, types and layers
+	@$(PYTHON) -m pytest tests/integrity/test_static.py
+
+integrity: setup ## these, records, dependencies, and how notebooks are built
+	@$(PYTHON) -m pytest tests/integrity
 
 nbval: setup ## check the notebooks alone
-	@status=0
-	report="$$($(PYTHON) -m pytest --nbval notebooks 2>&1)" || status=$$?
-	printf '\n%s\n' "$$report"
-	exit $$status
+	@$(PYTHON) -m pytest --nbval notebooks
 
 coverage: setup ## run the tests and say which lines of zerobev/ they reach
 	@$(PYTHON) -m coverage run -m pytest tests

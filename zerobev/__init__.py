@@ -3,7 +3,12 @@
 `zerobev.load().project(rgb, modality)` is all that most uses need; see `zerobev.inference`.
 """
 
+import os
 from typing import TYPE_CHECKING, Any
+
+# OpenMP reads this when torch is loaded. By default its threads spin while they wait for each other: beside two other
+# busy processes on two cores, that makes a training step more than ten times as slow.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from zerobev.inference import BevArrows, BevMap, Boxes, Flow, Labels, Masks, Probabilities, Projector, load

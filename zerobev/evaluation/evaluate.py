@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, distributed, nn
 
+from zerobev.common.memory import keep_freed_memory
 from zerobev.evaluation.metrics import Counts, count
 from zerobev.training.distributed import rank_and_world_size
 from zerobev.training.loader import Batch, model_inputs
@@ -24,6 +25,7 @@ def evaluate(
         of several processes each brings its own, and gets the counts of all
     n_classes: K
     """
+    keep_freed_memory()
     total = Counts.empty(n_scenes, n_classes)
     with torch.inference_mode():
         for batch in batches:

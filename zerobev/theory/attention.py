@@ -69,7 +69,7 @@ def train(
     values: Tensor,
     target: Tensor,
     rng: np.random.Generator,
-    steps: int = 300,
+    steps: int = 200,
     batch: int = 96,
     learning_rate: float = 0.03,
 ) -> Progress:

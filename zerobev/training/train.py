@@ -29,6 +29,7 @@ from safetensors.torch import save_model
 from torch import Tensor, distributed, nn
 
 from zerobev.common.errors import InputError
+from zerobev.common.memory import keep_freed_memory
 from zerobev.common.progress import progress
 from zerobev.common.storage import replacing
 from zerobev.config import AUX, TrainConfig
@@ -85,6 +86,7 @@ def train(
     device: default: a GPU if there is one. Forward passes are bfloat16 where the processor computes in it.
     workers: processes that draw batches, as `training.loader.batches` takes them
     """
+    keep_freed_memory()
     accelerator = training_accelerator(device)
     objective = objective or dice_objective(config.alpha)
     forked = [accelerator.device] if accelerator.device.type == "cuda" else []
