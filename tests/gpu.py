@@ -21,6 +21,7 @@ from zerobev import cli
 from zerobev.benchmarks.training import Machine, against_the_machine, training_step
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES
+from zerobev.experiments.provenance import git_revision, origin
 from zerobev.models import build
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -74,7 +75,7 @@ def main() -> None:
     on_gpu = machine.device.type == "cuda"
     sizes = {"paper": 16, "reduced": 16} if on_gpu else {"smoke": 4}
     found: dict[str, Any] = {name: measure_steps(machine, name, samples) for name, samples in sizes.items()}
-    found["device"] = torch.cuda.get_device_name() if on_gpu else "cpu"
+    found["origin"] = origin(torch.cuda.get_device_name() if on_gpu else "cpu", git_revision())
     if options.compile:
         found["compiled"] = measure_compiled(machine)
     print(json.dumps(found, indent=1))

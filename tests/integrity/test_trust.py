@@ -97,6 +97,12 @@ def test_the_readme_says_what_the_records_say():
         assert f"| ({row}) | {method} | {cells[0]} | {cells[1]} |" in readme
 
 
+def test_the_readme_says_what_a_gpu_takes():
+    step = json.loads((ROOT / "reports/gpu.json").read_text())["paper"]
+    milliseconds, memory = step["milliseconds"]["c"]["median"], step["memory_gb"]["c"]
+    assert f"{step['samples']} samples: {milliseconds:.0f} ms and {memory:.1f} GB" in (ROOT / "README.md").read_text()
+
+
 def test_published_numbers_are_those_that_were_checked():
     numbers = {
         number: {name: [*row.per_class, row.class_iou, row.pixel_iou] for name, row in rows.items()}

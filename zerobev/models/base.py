@@ -56,6 +56,8 @@ class BevModel(nn.Module):
             found = None if image is None else tuple(image.shape)
             if found is not None and len(found) == 4:
                 batch, channels = (batch or found[0]), (channels or found[1])
+            if image is not None and not image.is_floating_point():
+                raise InputError(f"{name}: expected floating point, found {image.dtype}")
             if found is None or found != (batch, channels, side, side):
                 expected = f"({batch or 'B'}, {channels or 'K'}, {side}, {side})"
                 raise InputError(f"{name}: expected {expected}, found {found}")

@@ -357,6 +357,16 @@ def test_with_one_gate_a_pixel_the_pooled_map_is_the_projection():
     assert ((on_map > 0.5) == (projected > 0.5))[inside].float().mean() > 0.9
 
 
+@pytest.mark.parametrize("row", ZERO_SHOT)
+def test_bytes_are_not_taken_for_values(row):
+    """Batches travel as bytes: a network that took 255 for white would give a wrong map."""
+    rgb, zero, depth = inputs(1)
+    with pytest.raises(InputError, match="rgb: expected floating point, found torch.uint8"):
+        network(row)((255 * rgb).byte(), zero, depth)
+    with pytest.raises(InputError, match="zero: expected floating point, found torch.bool"):
+        network(row)(rgb, zero > 0.5, depth)
+
+
 # --- checkpoints
 
 
