@@ -361,9 +361,9 @@ def test_with_one_gate_a_pixel_the_pooled_map_is_the_projection():
 def test_bytes_are_not_taken_for_values(row):
     """Batches travel as bytes: a network that took 255 for white would give a wrong map."""
     rgb, zero, depth = inputs(1)
-    with pytest.raises(InputError, match="rgb: expected floating point, found torch.uint8"):
+    with pytest.raises(InputError, match=r"rgb: expected floating point, found torch\.uint8"):
         network(row)((255 * rgb).byte(), zero, depth)
-    with pytest.raises(InputError, match="zero: expected floating point, found torch.bool"):
+    with pytest.raises(InputError, match=r"zero: expected floating point, found torch\.bool"):
         network(row)(rgb, zero > 0.5, depth)
 
 
