@@ -166,7 +166,7 @@ MUTATIONS = (
         "zerobev/experiments/runs.py",
         'test = self.views("test", "estimated" if estimated else "true")',
         'test = self.views("test", "true")',
-        (f"{_RUNS}test_projections_are_what_their_depth_says",),
+        (f"{_RUNS}test_projections_use_the_depth_of_their_row",),
     ),
     # the theorem
     Mutation(

@@ -1,6 +1,6 @@
 """The data of one scale on this machine: scenes, views and textures, made at their first use.
 
-All of it can be made again and lies in the ignored folder `.cache`; results lie in `reports`.
+Data lie in the ignored folder `.cache` and can be made again; results lie in `reports`.
 """
 
 import os
@@ -33,12 +33,13 @@ class Workspace:
     """Scenes, views and textures of a scale, from generated homes or from a folder of scenes."""
 
     def __init__(self, scale: str, scenes: str = "", root: Path | None = None, settings: Sequence[str] = ()) -> None:
-        """Choose the scale and the scenes; nothing is made yet.
+        """Choose scale and scenes; nothing is made yet.
 
         scale: a name in `config.SCALES`
         scenes: a folder in HM3DSem layout; "" for generated homes
         root: the folder of `.cache` and `reports`; default: `common.paths.zerobev_home()`
-        settings: values of the scale that are changed, such as `train.steps=2400`, see `common.settings`
+        settings: changed values of the scale, such as `train.steps=2400`, see `common.settings`
+        Raises `InputError` for an unknown scale or setting, or a missing folder.
         """
         root = root or zerobev_home()
         self._arguments = scale, scenes, root
@@ -59,7 +60,7 @@ class Workspace:
 
     @cached_property
     def data_config(self) -> dict[str, Any]:
-        """Everything that the views depend on: a part of the configuration of every run."""
+        """Everything that the views depend on; part of the configuration of every run."""
         found = {
             "version": versions.DATA,
             **recorded_with(self.scale.camera, self.scale.texture),
@@ -83,12 +84,12 @@ class Workspace:
 
     @cached_property
     def views_folder(self) -> Path:
-        """Folder of the shards, a folder per split in it."""
+        """Folder of the shards, with a folder per split."""
         return self.cache / f"views-{fingerprint(self.data_config)}"
 
     @property
     def split(self) -> SceneFolders:
-        """Folders of the training, validation and test scenes; generated ones may not be written yet."""
+        """Folders of the training, validation and test scenes; those of generated homes may not exist yet."""
         if self.source:
             return split_scenes(self.source)
         return home_folders(self.cache / f"homes-{versions.DATA}-{self.scale.scenes.seed}", self.scale.scenes)
@@ -101,9 +102,9 @@ class Workspace:
         return read_scene(folder)
 
     def views(self, split: Split, scenes: int | None = None) -> ViewSet:
-        """The recorded views of the first `scenes` scenes of a split (default: all), recorded now if missing.
+        """Views of the first `scenes` scenes of a split (default: all); missing shards are made now.
 
-        Raises `InputError` that names the scenes which could not be recorded.
+        Raises `InputError` with the scenes that failed.
         """
         folders = list(self.split.of(split)[:scenes])
         seed = self.scale.scenes.seed + config.SPLITS.index(split)
@@ -118,7 +119,7 @@ class Workspace:
         return ViewSet([Shard(shard_path(f, out), self.scale.camera, self.scale.texture) for f in folders])
 
     def bank(self, texture: TextureConfig | None = None) -> TextureBank:
-        """A texture bank, by default of this scale's textures; from DTD's images or procedural ones."""
+        """A texture bank, by default of this scale's textures, from DTD's images or procedural images."""
         texture = texture or self.scale.texture
         path = self.cache / f"textures-{fingerprint(self.texture_config(texture))}.npz"
         if not path.exists():
