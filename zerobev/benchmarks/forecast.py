@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
 from zerobev.common.errors import InputError
-from zerobev.config import SCALES, SPLITS, Scale
+from zerobev.config import SPLITS, Scale
 from zerobev.data.generate import shard_path
 from zerobev.data.samples import SynthSamples, ViewSet, as_float, collate, semantic_sample
 from zerobev.data.shards import Shard, write_shard
@@ -30,7 +30,7 @@ from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.provenance import peak_memory_mb
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.runs import SEEDS, Run
-from zerobev.experiments.workspace import Workspace
+from zerobev.experiments.workspace import Workspace, add_workspace_arguments
 from zerobev.models import build
 from zerobev.models.depth import DepthNet
 from zerobev.scenes.readers import read_scene
@@ -221,8 +221,7 @@ def _gb(size: float) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev plan`."""
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    add_workspace_arguments(parser)
     parser.add_argument("--textures", type=Path, metavar="DIR", help="texture images for the zero-shot stream")
     parser.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="values, such as train.steps=2400"

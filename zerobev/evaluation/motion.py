@@ -49,7 +49,7 @@ class MovingPair:
 
 
 def moving_pair(scene: Scene, camera: CameraConfig, rng: np.random.Generator) -> MovingPair | None:
-    """A random object of a generated home, moved by a random shift along the floor before a random camera.
+    """A random object of a generated home, moved by a random shift along the floor in view of a random camera.
 
     The object stays visible from above, so that it neither enters a wall nor leaves the map. None if no such motion is
     found.

@@ -12,18 +12,17 @@ from accelerate import PartialState
 from filelock import FileLock
 
 from zerobev.common.parallel import cluster
-from zerobev.config import SCALES, SPLITS, Split
+from zerobev.config import SPLITS, Split
 from zerobev.experiments.registry import EXPERIMENTS, experiment
 from zerobev.experiments.runs import Run
-from zerobev.experiments.workspace import Workspace
+from zerobev.experiments.workspace import Workspace, add_workspace_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev run`."""
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
+    add_workspace_arguments(parser)
     parser.add_argument("--row", required=True, help=f"one of {', '.join(EXPERIMENTS)}")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
     parser.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="values, such as train.steps=2400"
     )

@@ -211,7 +211,7 @@ def recorded(rows: Iterable[str], workspace: Workspace) -> list[RunRecord]:
 
 
 def records_of(rows: Iterable[str], workspace: Workspace) -> list[RunRecord]:
-    """As `recorded`; before, the first seed of each row is computed if it is missing."""
+    """As `recorded`, after the first seed of each row is computed if it is missing."""
     rows = list(rows)
     for row in rows:
         Run(experiment(row), workspace, SEEDS[0]).record()

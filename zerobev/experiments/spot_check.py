@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from zerobev.common.errors import InputError
-from zerobev.config import SCALES
 from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.experiments.runs import Run
-from zerobev.experiments.workspace import Workspace
+from zerobev.experiments.workspace import Workspace, add_workspace_arguments
 
 _SEED = 0
 
@@ -68,8 +67,7 @@ def spot_check(workspace: Workspace, row: str | None) -> SpotCheck:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev spot-check`."""
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    add_workspace_arguments(parser)
     parser.add_argument("--row", metavar="ROW", help="a recorded row; default: a different one each day")
 
 

@@ -3,6 +3,7 @@
 Data lie in the ignored folder `.cache` and can be made again; results lie in `reports`.
 """
 
+import argparse
 import os
 from collections.abc import Sequence
 from functools import cached_property
@@ -14,9 +15,9 @@ import numpy as np
 from zerobev import config
 from zerobev.common.errors import InputError
 from zerobev.common.keys import fingerprint
-from zerobev.common.paths import zerobev_home
+from zerobev.common.paths import report_name, zerobev_home
 from zerobev.common.settings import changed_by
-from zerobev.config import SPLITS, Split, TextureConfig
+from zerobev.config import SCALES, SPLITS, Split, TextureConfig
 from zerobev.data.generate import generate, shard_path
 from zerobev.data.patterns import SourceImages
 from zerobev.data.samples import ViewSet
@@ -27,6 +28,12 @@ from zerobev.scenes.hm3dsem import SceneFolders
 from zerobev.scenes.homes import ensure_home, ensure_homes, home_folders
 from zerobev.scenes.readers import read_scene, split_scenes
 from zerobev.scenes.scene import Scene
+
+
+def add_workspace_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of a command that choose its workspace."""
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
+    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
 
 
 class Workspace:
@@ -48,7 +55,7 @@ class Workspace:
         self.source = Path(scenes).expanduser().resolve() if scenes else None
         if self.source and not self.source.is_dir():
             raise InputError(f"scenes: expected a folder in HM3DSem layout, found nothing at {scenes}")
-        self.reports = root / "reports" / (f"{scale}-{self.source.name}-scenes" if self.source else scale)
+        self.reports = root / "reports" / report_name(scale, self.source)
         textures = os.environ.get("ZEROBEV_TEXTURES")  # set by `make reproduce TEXTURES=...`
         self._textures = Path(textures) if textures else None
         self.cache = root / ".cache"

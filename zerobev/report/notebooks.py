@@ -25,7 +25,7 @@ from nbformat import NotebookNode
 from papermill.exceptions import PapermillExecutionError
 
 from zerobev.common.errors import InputError
-from zerobev.common.paths import PACKAGE_PARENT, zerobev_home
+from zerobev.common.paths import PACKAGE_PARENT, report_name, zerobev_home
 from zerobev.common.storage import replacing
 from zerobev.config import SCALES, one_of
 
@@ -34,11 +34,6 @@ NOTEBOOKS = PACKAGE_PARENT / "notebooks"
 
 class NotebookError(Exception):
     """A notebook failed; the message names the notebook, the cell and the error."""
-
-
-def report_name(scale: str, scenes: Path | None) -> str:
-    """Name of the folder in `reports/`: the scale's name, or `<scale>-<folder>-scenes` for scenes from a folder."""
-    return scale if scenes is None else f"{scale}-{scenes.resolve().name}-scenes"
 
 
 def kernel_settings() -> dict[str, str]:

@@ -23,12 +23,11 @@ import pandas as pd
 
 from zerobev.common.paths import PACKAGE_PARENT
 from zerobev.common.storage import replacing, write_json
-from zerobev.config import SCALES
 from zerobev.experiments.gallery import gallery
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.experiments.runs import SEEDS, recorded
-from zerobev.experiments.workspace import Workspace
+from zerobev.experiments.workspace import Workspace, add_workspace_arguments
 from zerobev.report.claims import VERDICTS, compare, judge
 from zerobev.report.figures import averages_figure, gallery_figure
 from zerobev.report.own_rows import OWN_CLAIMS
@@ -158,8 +157,7 @@ def _save(figure: plt.Figure, folder: Path, name: str, text: str) -> Figure:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev summary`."""
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    add_workspace_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> None:

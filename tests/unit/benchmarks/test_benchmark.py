@@ -38,9 +38,9 @@ def test_blocks_are_all_of_a_step():
 
 
 def test_a_roofline_in_closed_form():
-    """At 1 GFLOP and 1 MB a millisecond: 1 TFLOP/s and 1 GB/s."""
+    """At 1 GFLOP and 1 MB per millisecond: 1 TFLOP/s and 1 GB/s."""
     a, b = torch.rand(2, 1000, 250)
-    assert min_milliseconds(lambda: a + b, 1, 1) == pytest.approx(3)  # two read, one written, a megabyte each
+    assert min_milliseconds(lambda: a + b, 1, 1) == pytest.approx(3)  # two read, one written, one megabyte each
     assert min_milliseconds(lambda: a.add_(b), 1, 1) == pytest.approx(2)
     assert min_milliseconds(lambda: a + b[:1], 1, 1) == pytest.approx(2.001)
     assert min_milliseconds(lambda: a.T.unsqueeze(0).detach().view(1, 250, 1000), 1, 1) == 0

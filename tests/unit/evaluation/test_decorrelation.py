@@ -175,10 +175,8 @@ def test_a_planted_dependence_is_found_and_sized(error, rng):
     white = 0.25 * (1 - error) + 0.75 * error
     conditional = entropy(error) if error else 0
     assert bits.own == pytest.approx(entropy(white) - conditional, abs=0.08)
-    hit, alarm = (
-        0.25 * (1 - error) / white,
-        0.25 * error / (1 - white),
-    )  # probability of the class in a white cell, in a black cell
+    # probability of the class in a white cell, in a black cell
+    hit, alarm = 0.25 * (1 - error) / white, 0.25 * error / (1 - white)
     assert auc.own == pytest.approx(0.5 + (hit - alarm) / 2, abs=0.03)
     # exchanged maps show no dependence
     assert bits.exchanged < 0.02 and abs(auc.exchanged - 0.5) < 0.1

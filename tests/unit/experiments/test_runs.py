@@ -221,11 +221,11 @@ def test_training_never_opens_a_test_scene(workspace, monkeypatch, tmp_path):
     assert not {*split.train, *split.validation} & {*split.test}
 
 
-def test_spot_check_agrees_with_an_honest_record_and_not_with_a_changed_one(workspace):
+def test_spot_check_agrees_only_with_an_unchanged_record(workspace):
     assert spot_check(workspace, "a.1").agrees
     path = Run(PROJECTION, workspace).store.path(Run(PROJECTION, workspace).key)
-    honest = path.read_text()
-    record = json.loads(honest)
+    original = path.read_text()
+    record = json.loads(original)
     counts = record["result"]["counts"]
     counts["intersection"] = [[cells // 2 for cells in scene] for scene in counts["intersection"]]
     path.write_text(json.dumps(record))
@@ -233,7 +233,7 @@ def test_spot_check_agrees_with_an_honest_record_and_not_with_a_changed_one(work
         changed = spot_check(workspace, "a.1")
         assert not changed.agrees and "DOES NOT AGREE" in str(changed)
     finally:
-        path.write_text(honest)
+        path.write_text(original)
     with pytest.raises(InputError, match=r"expected one of the recorded rows a\.1, a\.2, c, d, found 'z'"):
         spot_check(workspace, "z")
 

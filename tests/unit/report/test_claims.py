@@ -1,4 +1,4 @@
-"""Verdicts on claims, and quotients of rows, from records whose numbers are known by hand."""
+"""Verdicts on claims, and quotients of rows, from records with known numbers."""
 
 import numpy as np
 import pytest
