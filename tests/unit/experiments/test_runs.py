@@ -81,6 +81,18 @@ def test_every_row_of_every_table_is_a_run_and_each_run_is_one_row():
         experiment("z")
 
 
+def test_a_misspelt_depth_stream_or_split_is_an_error(workspace):
+    """True depth in place of misspelt estimated depth would make the row an oracle."""
+    for field, value in (("test_depth", "predicted"), ("train_depth", ("true", "estimate")), ("stream", "texture")):
+        with pytest.raises(InputError, match=f"{field}: expected one of .*, found"):
+            replace(RESIDUAL, **{field: value})
+    run = Run(RESIDUAL, workspace)
+    with pytest.raises(InputError, match="depth: expected one of true, estimated, found 'predicted'"):
+        run.views("test", "predicted")
+    with pytest.raises(InputError, match="split: expected one of train, validation, test, found 'val'"):
+        workspace.views("val")
+
+
 @pytest.mark.parametrize("row, predicted", [("a.1", False), ("a.2", True)])
 def test_projections_use_the_depth_of_their_row(workspace, row, predicted):
     """Row (a.2) must never read true depth: its counts are those of estimated depth, view by view."""
