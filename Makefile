@@ -21,7 +21,7 @@ RENDERER := .venv/.renderer
 MESA := libegl1 libgl1 libgl1-mesa-dri
 
 export TOKENIZERS_PARALLELISM ?= false
-# Packages come from .venv alone.
+# Packages come only from .venv.
 unexport PYTHONHOME PYTHONPATH
 
 .PHONY: help setup reproduce check test unit fast integration static integrity nbval coverage lab notebooks clean distclean
@@ -29,8 +29,8 @@ unexport PYTHONHOME PYTHONPATH
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
 
-# With FRESH=1 every run is computed anyway; otherwise one record is held against a run of today.
-# With PLAN=1 it is only told what the run takes; at the paper's scale it is told first, and refused where it cannot be.
+# FRESH=1 computes all runs again; otherwise one recorded run is computed again and compared with its record.
+# PLAN=1 only prints a forecast of the cost; at the paper's scale it comes first, and ends the run if the machine is too small.
 reproduce: setup ## run the workbook [SCALE=smoke|reduced|paper SCENES=dir TEXTURES=dir FRESH=1 SPOT=row PLAN=1]
 	@fresh="$(filter-out 0,$(FRESH))"
 	plan="$(filter-out 0,$(PLAN))"
@@ -45,7 +45,7 @@ reproduce: setup ## run the workbook [SCALE=smoke|reduced|paper SCENES=dir TEXTU
 	[ -n "$$fresh" ] || $(PYTHON) -m zerobev spot-check --scale "$$SCALE" $${SCENES:+--scenes "$$SCENES"} \
 	    $${SPOT:+--row "$$SPOT"}
 
-# Two parts at a time, the longest first: most of them compute on one core. What a part says is printed whole at its end.
+# Two parts at a time, the longest first: most of them use one core. The output of a part is printed at its end.
 PARTS := $(MAKE) --jobs=2 --keep-going --output-sync=target
 
 test: setup ## run all tests, and check every notebook against its committed outputs
@@ -60,19 +60,19 @@ unit: setup ## the unit tests alone
 fast: setup ## the unit tests that are not slow
 	@$(PYTHON) -m pytest tests/unit -m "not slow"
 
-integration: setup ## the tests of several parts at work together
+integration: setup ## the tests of several rooms or processes
 	@$(PYTHON) -m pytest tests/integration
 
 static: setup ## style, types and layers
 	@$(PYTHON) -m pytest tests/integrity/test_static.py
 
-integrity: setup ## these, records, dependencies, and how notebooks are built
+integrity: setup ## style, types, layers, records, dependencies, and the form of notebooks
 	@$(PYTHON) -m pytest tests/integrity
 
 nbval: setup ## check the notebooks alone
 	@$(PYTHON) -m pytest --nbval notebooks
 
-coverage: setup ## run the tests and say which lines of zerobev/ they reach
+coverage: setup ## run the tests and print their coverage of each file of zerobev/
 	@$(PYTHON) -m coverage run -m pytest tests
 	$(PYTHON) -m coverage report --skip-covered --sort=cover
 
@@ -100,7 +100,7 @@ clean: ## remove caches (shards and checkpoints too), executed notebooks and log
 distclean: clean ## as clean, and remove .venv
 	@rm -rf .venv
 
-# `.unfinished` lies in .venv from the first to the last step of a set-up: one that was killed starts from nothing.
+# .venv contains `.unfinished` during a set-up: after an interruption, the next set-up starts from nothing.
 $(READY): environment.txt pyproject.toml
 	@if [ -e .venv/.unfinished ]; then rm -rf .venv; fi
 	if [ ! -e $(PYTHON) ]; then
@@ -133,7 +133,7 @@ pyrender.OffscreenRenderer(8, 8).render(scene)
 endef
 export OPEN_EGL
 
-# A context is opened rather than a file looked for: only that shows that photographs can be taken here.
+# Only an opened context, and no file, shows that photographs can be rendered here.
 $(RENDERER): $(READY)
 	@opens() { $(PYTHON) -c "$$OPEN_EGL" >/dev/null 2>&1; }
 	if ! opens; then

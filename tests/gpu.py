@@ -1,11 +1,11 @@
-"""All that needs a GPU, in one command: `python -m tests.gpu [--json FILE] [--compile] [-- ARGUMENTS OF zerobev run]`.
+"""All checks on a GPU, in one command: `python -m tests.gpu [--json FILE] [--compile] [-- ARGUMENTS OF zerobev run]`.
 
 1. The tests of the CUDA paths (`tests/unit/training/test_cuda.py`).
-2. A training step of rows (c), (b.2) and (f), at the sizes of `paper` and `reduced`: time, memory, and its share of the
-   rate of a matrix product and of the roofline. With `--compile`, a compiled step of (c) at `reduced`, too.
-3. `zerobev run` with the arguments after `--`, if there are any: the longest training that is due.
+2. A training step of rows (c), (b.2) and (f) at the sizes of `paper` and `reduced`: time, memory, and fractions of the
+   rate of a matrix product and of the roofline. With `--compile`, also a compiled step of (c) at `reduced`.
+3. `zerobev run` with the arguments after `--`, if any.
 
-Without a GPU the CUDA tests are skipped and named, and only the steps of the scale `smoke` are timed.
+Without a GPU, the CUDA tests are skipped and listed, and only steps of the scale `smoke` are timed.
 """
 
 import argparse
@@ -30,13 +30,13 @@ _REPEATS = 10
 
 
 def run_tests() -> bool:
-    """Run the tests of the CUDA paths; prints what was skipped, and why."""
+    """Run the tests of the CUDA paths; prints skipped tests with reasons."""
     command = [sys.executable, "-m", "pytest", "-q", "-rs", "tests/unit/training/test_cuda.py"]
     return subprocess.run(command, cwd=ROOT, check=False).returncode == 0
 
 
 def measure_steps(machine: Machine, name: str, samples: int) -> dict[str, Any]:
-    """A step of every row at a scale, beside a matrix product and a copy; and the memory of each on a GPU, GB."""
+    """A step of each row at a scale, against a matrix product and a copy; on a GPU also its peak memory, GB."""
     setting = SCALES[name]
     runs, memory = {}, {}
     for row in ROWS:
@@ -53,7 +53,7 @@ def measure_steps(machine: Machine, name: str, samples: int) -> dict[str, Any]:
 
 
 def measure_compiled(machine: Machine) -> dict[str, Any]:
-    """A step of (c) at `reduced`, as it is and with `torch.compile`, in turns; milliseconds."""
+    """Milliseconds of a step of (c) at `reduced`, eager and with `torch.compile`, interleaved."""
     setting = SCALES["reduced"]
     runs = {}
     for name in ("eager", "compiled"):
@@ -64,7 +64,7 @@ def measure_compiled(machine: Machine) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the tests, time the steps, go on with a training; exit code 1 if a test failed."""
+    """Run the tests, time the steps, run the training; exit code 1 if a test failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.gpu", description=__doc__)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the times there")
     parser.add_argument("--compile", action="store_true", help="also time a compiled step")

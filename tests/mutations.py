@@ -1,7 +1,7 @@
-"""Do the tests notice? `python -m tests.mutations [NAME ...]` makes one change at a time and runs the tests it is for.
+"""Mutation tests: `python -m tests.mutations [NAME ...]` makes one wrong change at a time and runs its tests.
 
-Everything happens in a temporary copy of the tree, files that are not committed yet included. The tests of a change
-are run without it first: those that fail anyway show nothing. Exit code 1 where a change is missed.
+All happens in a temporary copy of the working tree. The tests first run without any change and must pass. Exit code 1
+if a change is missed.
 """
 
 import argparse
@@ -24,16 +24,16 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Mutation:
-    """One change, and the tests that have to fail with it: a part of those that `make test` runs."""
+    """A wrong change, and the tests of `make test` of which one must fail."""
 
     name: str
-    file: str  #: or the pattern of several; all are changed
-    old: str | re.Pattern[str]  #: found once in each file
+    file: str  #: path or pattern; all matching files are changed
+    old: str | re.Pattern[str]  #: must occur once per file
     new: str | Callable[[re.Match[str]], str]
     tests: tuple[str, ...]  #: arguments of pytest
 
     def apply(self, text: str) -> str:
-        """The file's text with the change; an `InputError` where it does not fit exactly one place."""
+        """The text with the change. Raises `InputError` unless `old` occurs exactly once."""
         pattern = self.old if isinstance(self.old, re.Pattern) else re.compile(re.escape(self.old))
         found = len(pattern.findall(text))
         if found != 1:
@@ -78,7 +78,7 @@ MUTATIONS = (
         "zerobev/report/paper.py",
         re.compile(r'(\("c\.10", "[^"]*", )("[^"]*")(\),\s*\("c\.15", "[^"]*", )("[^"]*")'),
         r"\1\4\3\2",
-        ("tests/integrity/test_trust.py::test_published_numbers_are_those_that_were_checked",),
+        ("tests/integrity/test_trust.py::test_published_numbers_are_unchanged",),
     ),
     # axes of the map
     Mutation(
@@ -111,28 +111,28 @@ MUTATIONS = (
     ),
     # the zero-shot stream
     Mutation(
-        "zero-shot image a pixel to the right",
+        "zero-shot image one pixel to the right",
         "zerobev/data/samples.py",
-        '"zero": zero.astype(np.float32)',
-        '"zero": np.roll(zero, 1, axis=-1).astype(np.float32)',
+        '"zero": zero,',
+        '"zero": np.roll(zero, 1, axis=-1),',
         ("tests/unit/data/test_samples.py",),
     ),
     Mutation(
-        "textures a pixel down",
+        "textures one pixel down",
         "zerobev/data/samples.py",
         "[image.reshape(-1, 3) for image in texels]",
         "[np.roll(image, i == 0, 0).reshape(-1, 3) for i, image in enumerate(texels)]",
         ("tests/unit/data/test_samples.py",),
     ),
     Mutation(
-        "what is raised painted by the camera's place alone",
+        "extruded textures without the heading of the camera",
         "zerobev/data/samples.py",
         "(x * right + y * forward + view.pose[axis])",
         "(x * (axis == 0) + y * (axis == 1) + view.pose[axis])",
         ("tests/unit/data/test_samples.py",),
     ),
     Mutation(
-        "a batch where a share of it was asked for",
+        "a whole batch for each rank",
         "zerobev/training/loader.py",
         "self._source.batch(step, *self._place)",
         "self._source.batch(step)",
@@ -166,7 +166,7 @@ MUTATIONS = (
         "zerobev/experiments/runs.py",
         'test = self.views("test", "estimated" if estimated else "true")',
         'test = self.views("test", "true")',
-        (f"{_RUNS}test_projections_are_what_their_depth_says",),
+        (f"{_RUNS}test_projections_use_the_depth_of_their_row",),
     ),
     # the theorem
     Mutation(
@@ -178,7 +178,7 @@ MUTATIONS = (
     ),
     # speed and memory
     Mutation(
-        "views kept in memory",
+        "views cached in memory",
         "zerobev/data/shards.py",
         "h5py.File(self.path, rdcc_nbytes=0)",
         "h5py.File(self.path)",
@@ -189,13 +189,13 @@ MUTATIONS = (
         "zerobev/experiments/versions.py",
         re.compile(r"BENCHMARK = \d+"),
         lambda match: f"{match[0]}0",
-        ("tests/integrity/test_trust.py::test_what_is_measured_once_was_measured_by_this_code",),
+        ("tests/integrity/test_trust.py::test_measurements_were_made_by_this_code",),
     ),
 )
 
 
 def copy_tree(to: Path) -> None:
-    """All files that git knows or would take, as they stand in the working tree."""
+    """Copy all files of the working tree that git does not ignore."""
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -210,8 +210,8 @@ def copy_tree(to: Path) -> None:
 
 
 def run_tests(tree: Path, tests: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
-    """pytest in `tree`, with the package as it is there, until the first failure."""
-    # no compiled files: one of before a change may pass for that of the change
+    """Run pytest on the package in `tree`, until the first failure."""
+    # no bytecode: a stale file could hide a change
     variables = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     return subprocess.run(command, cwd=tree, env=variables, capture_output=True, text=True, check=False)
@@ -219,7 +219,7 @@ def run_tests(tree: Path, tests: tuple[str, ...]) -> subprocess.CompletedProcess
 
 @contextmanager
 def mutated(tree: Path, mutation: Mutation) -> Iterator[None]:
-    """The change, for the length of a `with`."""
+    """Apply the change, and undo it at the end of the `with`."""
     before = {path: path.read_text() for path in sorted(tree.glob(mutation.file))}
     if not before:
         raise InputError(f"{mutation.name}: expected a file {mutation.file}, found none")
@@ -234,17 +234,17 @@ def mutated(tree: Path, mutation: Mutation) -> Iterator[None]:
 
 
 def outcome(tree: Path, mutation: Mutation) -> str:
-    """What came of a change: "caught by TEST", "missed", or why that is not known."""
+    """Result of a change: "caught by TEST", "missed", or the reason why it is unknown."""
     with mutated(tree, mutation):
         ran = run_tests(tree, mutation.tests)
-    if ran.returncode not in (0, 1):  # 1: a test failed; all else says nothing of the tests
+    if ran.returncode not in (0, 1):  # 1: a test failed; others are errors of pytest
         return f"unknown: pytest ended with {ran.returncode}"
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", ran.stdout, re.MULTILINE)
     return f"caught by {failed[1]}" if ran.returncode and failed else "missed"
 
 
 def main() -> None:
-    """Parse the command line, try the changes, print what came of them."""
+    """Parse the command line, try the changes, print the results."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutations", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="; ".join(mutation.name for mutation in MUTATIONS))
     names = parser.parse_args().names or [mutation.name for mutation in MUTATIONS]

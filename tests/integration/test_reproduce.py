@@ -16,8 +16,9 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from zerobev import cli
 from zerobev.common.errors import InputError
+from zerobev.common.paths import report_name
 from zerobev.report import notebooks as workbook
-from zerobev.report.notebooks import NotebookError, kernel_settings, refresh, report_name, reproduce
+from zerobev.report.notebooks import NotebookError, kernel_settings, refresh, reproduce
 
 from support.paths import ROOT
 

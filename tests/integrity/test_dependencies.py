@@ -1,4 +1,4 @@
-"""Dependencies: every import is declared for the part of the package that needs it; pins and ranges agree."""
+"""Dependencies: each import is declared in the group of its room; pins and ranges agree."""
 
 import ast
 import sys
@@ -16,19 +16,19 @@ from support.paths import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = packages_distributions()
-#: Each holds those before it.
+#: Each group includes the groups before it.
 GROUPS = ("core", "scenes", "workbook", "dev")
-#: module or room of zerobev -> group; all others are core.
+#: Module or room of zerobev -> group; all others are core.
 GROUP_OF = {
     **dict.fromkeys(["common.parallel", "scenes", "rendering", "data", "evaluation"], "scenes"),
     **dict.fromkeys(["training", "experiments", "benchmarks", "report"], "workbook"),
 }
-#: Commands and plug-ins, which no module imports.
+#: Commands and plug-ins without an import.
 TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "setuptools"}
 
 
 def requirements(group: str) -> dict[str, Requirement]:
-    """Name -> requirement of a group, without those of the groups it holds."""
+    """Name -> requirement of a group, without the groups that it includes."""
     lines = PROJECT["dependencies"] if group == "core" else PROJECT["optional-dependencies"][group]
     found = {canonicalize_name(Requirement(line).name): Requirement(line) for line in lines}
     found.pop("zerobev", None)
@@ -36,12 +36,12 @@ def requirements(group: str) -> dict[str, Requirement]:
 
 
 def declared(group: str) -> set[str]:
-    """Names that an installation with a group has."""
+    """Names of all distributions of an installation with a group."""
     return {name for one in GROUPS[: GROUPS.index(group) + 1] for name in requirements(one)}
 
 
 def imported(source: str) -> set[str]:
-    """Full names of all modules that `source` imports, within functions too; of `from a import b` both a and a.b."""
+    """Full names of all modules that `source` imports, also in functions; `from a import b` gives a and a.b."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -52,7 +52,7 @@ def imported(source: str) -> set[str]:
 
 
 def distributions(names: set[str]) -> set[str]:
-    """The distributions of imported modules, but for the standard library, zerobev and the tests' own."""
+    """Distributions of imported modules, without the standard library, zerobev and the tests."""
     roots = {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"zerobev", "support"}
     return {canonicalize_name(DISTRIBUTIONS[root][0]) for root in roots}
 
@@ -72,7 +72,7 @@ def group_of(module: str) -> str:
 
 @cache
 def needed(module: str) -> frozenset[str]:
-    """The modules of zerobev that are loaded with `module`, parents and itself included."""
+    """The modules of zerobev that are loaded with `module`, including itself and its parents."""
     loaded, waiting = set(), [module]
     while waiting:
         name = waiting.pop()
@@ -83,12 +83,12 @@ def needed(module: str) -> frozenset[str]:
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_what_a_module_needs_is_declared(module: str):
+def test_imports_of_a_module_are_declared(module: str):
     names = {name for one in needed(module) for name in MODULES[one]}
     assert distributions(names) <= declared(group_of(module))
 
 
-def test_what_tests_and_notebooks_import_is_declared():
+def test_imports_of_tests_and_notebooks_are_declared():
     tests = {name for path in (ROOT / "tests").rglob("*.py") for name in imported(path.read_text())}
     assert distributions(tests) <= declared("dev")
     cells = [cell for path in (ROOT / "notebooks").glob("*.ipynb") for cell in nbformat.read(path, as_version=4).cells]
@@ -97,7 +97,7 @@ def test_what_tests_and_notebooks_import_is_declared():
 
 
 @pytest.mark.parametrize("group", GROUPS[:-1])
-def test_what_is_declared_is_used(group: str):
+def test_declared_dependencies_are_used(group: str):
     used = {name for module, names in MODULES.items() if group_of(module) == group for name in names}
     assert set(requirements(group)) - TOOLS <= distributions(used)
 

@@ -1,4 +1,4 @@
-"""How every committed notebook is built; what its cells compute is nbval's to check (`pytest --nbval notebooks`)."""
+"""The form of the committed notebooks; nbval checks their outputs (`pytest --nbval notebooks`)."""
 
 import ast
 import base64
@@ -18,7 +18,7 @@ from PIL import Image
 from support.paths import ROOT
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-#: What a cell that draws calls: matplotlib, or a function of the library whose name says so.
+#: Calls that draw: matplotlib, or a function of the library with "figure" or "grid" in its name.
 DRAWS = re.compile(r"\bplt\.(?!rc|style|close)|\bfigure\b *[.=]|\bgrid\(|\.(?:imshow|plot)\(")
 LINK = re.compile(r"""\]\((?!https?:|#)([^)#\s]+)|href=['"](?!https?:|#)([^'"#]+)""")
 ABSOLUTE_PATH = re.compile(r"(?<![\w.:/<])/(?:home|root|tmp|work|usr|opt|var|mnt|data|srv|Users|private)\b|\b[A-Z]:\\")
@@ -35,7 +35,7 @@ def tags(cell: NotebookNode) -> list[str]:
 
 
 def links(text: str) -> set[str]:
-    """Where links in Markdown and HTML lead, but for those to other sites and within a page."""
+    """Targets of links in Markdown and HTML, without links to other sites and within a page."""
     return {markdown or link for markdown, link in LINK.findall(text)}
 
 
@@ -44,20 +44,20 @@ def outputs(notebook: NotebookNode) -> list[NotebookNode]:
 
 
 def images(cell: NotebookNode) -> list[np.ndarray]:
-    """The PNG images a cell shows, (H, W, C) uint8."""
+    """The PNG images in the output of a cell, (H, W, C) uint8."""
     shown = [output.data["image/png"] for output in cell.outputs if "image/png" in output.get("data", {})]
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(image)))) for image in shown]
 
 
 def ignores_output(cell: NotebookNode) -> bool:
-    """Whether nbval leaves the outputs of a cell unchecked, by a tag or by a comment."""
+    """Whether a tag or a comment excludes the outputs of a cell from nbval."""
     marks = {tag.upper().replace("-", "_") for tag in tags(cell)}
     marks |= {line.strip(" #") for line in cell.source.splitlines() if line.lstrip().startswith("#")}
     return bool(marks & IGNORING)
 
 
 def makefile_parameters() -> dict[str, str]:
-    """The parameters' defaults in the Makefile."""
+    """Defaults of the parameters in the Makefile."""
     found = re.findall(r"^(SCALE|SCENES) \?=[ ]*(\S*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert len(found) == 2
     return dict(found)
@@ -87,7 +87,7 @@ def every_figure_is_shown(notebook: NotebookNode) -> None:
         assert all(image.std(axis=(0, 1)).any() for image in images(cell)), f"an empty picture below: {cell.source}"
 
 
-def takes_the_command_s_parameters(notebook: NotebookNode) -> None:
+def has_the_parameters_of_the_command(notebook: NotebookNode) -> None:
     assert not [cell for cell in notebook.cells if "injected-parameters" in tags(cell)]
     (cell,) = [cell for cell in notebook.cells if "parameters" in tags(cell)]
     statements = ast.parse(cell.source).body
@@ -97,14 +97,14 @@ def takes_the_command_s_parameters(notebook: NotebookNode) -> None:
 
 
 def is_plain_python(notebook: NotebookNode) -> None:
-    """No magics, no shell, no classes; no `;` at the end, which hides a value from Jupyter but not from nbval."""
+    """No magics, shell commands or classes; no `;` at the end, which hides a value in Jupyter but not in nbval."""
     for cell in code_cells(notebook):
         nodes = list(ast.walk(ast.parse(cell.source)))
         assert not [node for node in nodes if isinstance(node, ast.ClassDef)]
         assert "get_ipython" not in cell.source and not cell.source.rstrip().endswith(";")
 
 
-def names_no_place_on_a_machine(notebook: NotebookNode) -> None:
+def contains_no_machine_paths(notebook: NotebookNode) -> None:
     texts = [cell.source for cell in notebook.cells]
     for output in outputs(notebook):
         texts += [output.get("text", ""), *(str(v) for k, v in output.get("data", {}).items() if "image" not in k)]
@@ -118,7 +118,7 @@ def cells_are_short(notebook: NotebookNode) -> None:
     assert statistics.median(lines) <= 5 and max(lines) <= 25
 
 
-def prose_leads_to_every_code_cell(notebook: NotebookNode) -> None:
+def prose_precedes_every_code_cell(notebook: NotebookNode) -> None:
     words = []
     for before, cell in zip([None, *notebook.cells], notebook.cells):
         if cell.cell_type == "code":
@@ -127,18 +127,18 @@ def prose_leads_to_every_code_cell(notebook: NotebookNode) -> None:
     assert 20 <= statistics.median(words) <= 120
 
 
-def says_how_long_it_takes(notebook: NotebookNode) -> None:
+def states_its_time(notebook: NotebookNode) -> None:
     assert "**Time.**" in notebook.cells[0].source
 
 
-def every_link_leads_to_a_file(notebook: NotebookNode) -> None:
+def every_link_is_a_file(notebook: NotebookNode) -> None:
     texts = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
     texts += [output.data.get("text/html", "") for output in outputs(notebook) if "data" in output]
     for link in set().union(*map(links, texts)):
         assert (ROOT / "notebooks" / link).is_file(), link
 
 
-def ends_with_what_was_checked(notebook: NotebookNode) -> None:
+def ends_with_a_table_of_checks(notebook: NotebookNode) -> None:
     assert "What we checked" in [cell for cell in notebook.cells if cell.cell_type == "markdown"][-1].source
 
 
@@ -147,14 +147,14 @@ CHECKS = (
     executed_from_top_to_bottom,
     has_clean_outputs,
     every_figure_is_shown,
-    takes_the_command_s_parameters,
+    has_the_parameters_of_the_command,
     is_plain_python,
-    names_no_place_on_a_machine,
+    contains_no_machine_paths,
     cells_are_short,
-    prose_leads_to_every_code_cell,
-    says_how_long_it_takes,
-    every_link_leads_to_a_file,
-    ends_with_what_was_checked,
+    prose_precedes_every_code_cell,
+    states_its_time,
+    every_link_is_a_file,
+    ends_with_a_table_of_checks,
 )
 
 
@@ -173,7 +173,7 @@ def test_few_outputs_are_ignored():
     assert sum(map(ignores_output, cells)) < 0.05 * len(cells)
 
 
-# The checks themselves: a sound notebook passes all of them, and each way to spoil it fails the check it belongs to.
+# Tests of the checks: a sound notebook passes all checks, and each spoiled copy fails its own.
 
 
 def sound_notebook() -> NotebookNode:
@@ -210,25 +210,28 @@ SPOILED = (
     (has_clean_outputs, set_output(5, new_output("stream", name="stderr", text="warning"))),
     (every_figure_is_shown, set_output(3)),
     (every_figure_is_shown, set_output(5, new_output("display_data", {"text/plain": "<Figure size 1x1>"}))),
-    (takes_the_command_s_parameters, set_source(1, 'SCALE = "smoke"\nSCENES = ""')),
-    (takes_the_command_s_parameters, set_source(1, 'SCALE = str("reduced")\nSCENES = ""')),
-    (takes_the_command_s_parameters, lambda notebook: notebook.cells[1].metadata.update(tags=[])),
-    (takes_the_command_s_parameters, lambda notebook: notebook.cells[5].metadata.update(tags=["injected-parameters"])),
+    (has_the_parameters_of_the_command, set_source(1, 'SCALE = "smoke"\nSCENES = ""')),
+    (has_the_parameters_of_the_command, set_source(1, 'SCALE = str("reduced")\nSCENES = ""')),
+    (has_the_parameters_of_the_command, lambda notebook: notebook.cells[1].metadata.update(tags=[])),
+    (
+        has_the_parameters_of_the_command,
+        lambda notebook: notebook.cells[5].metadata.update(tags=["injected-parameters"]),
+    ),
     (is_plain_python, set_source(5, "%matplotlib inline")),
     (is_plain_python, set_source(5, "!ls")),
     (is_plain_python, set_source(5, "if True:\n    class Local: ...")),
     (is_plain_python, set_source(5, "plt.plot([0, 1]);")),
-    (names_no_place_on_a_machine, set_source(5, 'open("/data/homes")')),
-    (names_no_place_on_a_machine, set_source(5, 'open("../homes")')),
-    (names_no_place_on_a_machine, set_output(5, new_output("stream", text="in /tmp/kernel_1"))),
+    (contains_no_machine_paths, set_source(5, 'open("/data/homes")')),
+    (contains_no_machine_paths, set_source(5, 'open("../homes")')),
+    (contains_no_machine_paths, set_output(5, new_output("stream", text="in /tmp/kernel_1"))),
     (cells_are_short, set_source(5, "1\n" * 26)),
     (cells_are_short, lambda notebook: [cell.update(source="1\n" * 6) for cell in code_cells(notebook)]),
-    (prose_leads_to_every_code_cell, lambda notebook: notebook.cells.pop(2)),
-    (prose_leads_to_every_code_cell, lambda notebook: [cell.update(source="Now:") for cell in notebook.cells[::2]]),
-    (says_how_long_it_takes, set_source(0, "Zero-BEV")),
-    (every_link_leads_to_a_file, set_source(0, "[gone](99_gone.ipynb)")),
-    (every_link_leads_to_a_file, set_output(5, new_output("display_data", {"text/html": "<a href='99.ipynb'>9</a>"}))),
-    (ends_with_what_was_checked, set_source(4, "The end.")),
+    (prose_precedes_every_code_cell, lambda notebook: notebook.cells.pop(2)),
+    (prose_precedes_every_code_cell, lambda notebook: [cell.update(source="Now:") for cell in notebook.cells[::2]]),
+    (states_its_time, set_source(0, "Zero-BEV")),
+    (every_link_is_a_file, set_source(0, "[gone](99_gone.ipynb)")),
+    (every_link_is_a_file, set_output(5, new_output("display_data", {"text/html": "<a href='99.ipynb'>9</a>"}))),
+    (ends_with_a_table_of_checks, set_source(4, "The end.")),
 )
 
 
@@ -252,7 +255,7 @@ def test_ignored_outputs_are_counted(tag: str):
     assert not ignores_output(new_code_cell("1  # NBVAL_IGNORE_OUTPUT", metadata={"tags": ["parameters"]}))
 
 
-def test_readme_and_tour_lead_to_every_notebook():
+def test_readme_and_tour_link_to_every_notebook():
     readme = links((ROOT / "README.md").read_text())
     assert {f"notebooks/{path.name}" for path in NOTEBOOKS} <= readme
     assert all((ROOT / link).exists() for link in readme)

@@ -1,4 +1,4 @@
-"""What is seen without running: style, types, what may be loaded, and files that are read in one sitting."""
+"""Static checks: style, types, layers, length of files, and no code execution when files are loaded."""
 
 import ast
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 from support.paths import ROOT
 
 SOURCES = sorted((ROOT / "zerobev").rglob("*.py"))
-#: Of a file. The longest are one idea each: a training loop, the arranging of rooms, texture banks.
+#: Per file. The longest ones hold one idea each: a training loop, texture banks.
 MAX_LINES = 340
 
 
@@ -24,17 +24,17 @@ def test_the_checkers_find_nothing(command: str):
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_file_is_read_in_one_sitting(path: Path):
+def test_a_file_is_short(path: Path):
     assert len(path.read_text().splitlines()) <= MAX_LINES
 
 
 def unsafe_loads(source: str) -> list[str]:
-    """Calls that would run what a file says. Ruff's S301 finds pickle itself."""
+    """Calls that could execute code from a file; ruff's S301 finds calls of pickle."""
     calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
-    said = [(ast.unparse(call.func), {ast.unparse(word) for word in call.keywords}) for call in calls]
+    found = [(ast.unparse(call.func), {ast.unparse(word) for word in call.keywords}) for call in calls]
     return [
         name
-        for name, words in said
+        for name, words in found
         if "allow_pickle=True" in words or (name == "torch.load" and "weights_only=True" not in words)
     ]
 

@@ -1,4 +1,4 @@
-"""What is published stands on what was recorded: no number, ours or the paper's, changes without a failing test."""
+"""Published numbers are recorded numbers: no number, ours or the paper's, changes without a failing test."""
 
 import hashlib
 import json
@@ -30,13 +30,13 @@ from support.records import run_record
 REPORTS = [ROOT / "reports" / scale for scale in SCALES if (ROOT / "reports" / scale / "records").is_dir()]
 PAPER = SHARED / "paper/zero-bev.tex"
 LABELS = ("results_main", "models", "re_models", "data_gen", "data_type")
-#: Of the published numbers as they were when they were held against the paper's own source.
+#: SHA-256 of the published numbers, computed when they were compared with the paper's source.
 PUBLISHED = "be36107f51292f5f2da4f5924f6a063a2d62f084141e0b4d0bc44922f9250994"
 
 
 @pytest.mark.parametrize("report", REPORTS, ids=lambda report: report.name)
 def test_records_are_as_they_were_written(report: Path):
-    """What is not sealed yet is by `store.write(store.find(key), store.maps(key))`."""
+    """`store.write(store.find(key), store.maps(key))` seals a record."""
     store = RunStore(report)
     keys = [path.stem for path in sorted((report / "records").glob("*.json"))]
     assert keys and [key for key in keys if not store.is_sealed(key)] == []
@@ -55,7 +55,7 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
         assert not store.is_sealed("c-0"), number
     store.path("c-0").write_text(text)
     assert store.is_sealed("c-0")
-    np.savez(tmp_path / "gallery/c-0.npz", maps=np.packbits(maps, axis=-1), cells=5)  # as before there were seals
+    np.savez(tmp_path / "gallery/c-0.npz", maps=np.packbits(maps, axis=-1), cells=5)  # without a seal
     assert np.array_equal(store.maps("c-0"), maps) and not store.is_sealed("c-0")
 
 
@@ -67,8 +67,8 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
         (recorded_unseen, "zerobev.experiments.recorded.ensure_homes"),
     ],
 )
-def test_what_is_measured_once_was_measured_by_this_code(monkeypatch, read, starts_with: str):
-    """Else a notebook measures it anew, and shows other figures than those it was committed with."""
+def test_measurements_were_made_by_this_code(monkeypatch, read, starts_with: str):
+    """Otherwise a notebook measures again, and its figures differ from the committed ones."""
 
     def unexpected(*_, **__) -> None:
         raise AssertionError("found no record of this code and these weights, expected a committed one")
@@ -77,7 +77,7 @@ def test_what_is_measured_once_was_measured_by_this_code(monkeypatch, read, star
     assert len(read(Workspace("reduced")))
 
 
-def test_the_page_of_results_says_what_the_records_say():
+def test_the_page_of_results_holds_the_numbers_of_the_records():
     workspace = Workspace("reduced")
     records = recorded(EXPERIMENTS, workspace)
     verdicts = [asdict(judge(claim, records)) for claim in (*CLAIMS, *OWN_CLAIMS)]
@@ -89,7 +89,7 @@ def test_the_page_of_results_says_what_the_records_say():
         pd.testing.assert_frame_equal(written, table(number, records), check_dtype=False)
 
 
-def test_the_readme_says_what_the_records_say():
+def test_the_readme_holds_the_numbers_of_the_records():
     results = table(1, recorded(EXPERIMENTS, Workspace("reduced")))[["class avg.", "pixel avg."]].unstack("source")
     readme = (ROOT / "README.md").read_text()
     for (row, method), values in results.iterrows():
@@ -97,13 +97,13 @@ def test_the_readme_says_what_the_records_say():
         assert f"| ({row}) | {method} | {cells[0]} | {cells[1]} |" in readme
 
 
-def test_the_readme_says_what_a_gpu_takes():
+def test_the_readme_holds_the_numbers_of_the_gpu():
     step = json.loads((ROOT / "reports/gpu.json").read_text())["paper"]
     milliseconds, memory = step["milliseconds"]["c"]["median"], step["memory_gb"]["c"]
     assert f"{step['samples']} samples: {milliseconds:.0f} ms and {memory:.1f} GB" in (ROOT / "README.md").read_text()
 
 
-def test_published_numbers_are_those_that_were_checked():
+def test_published_numbers_are_unchanged():
     numbers = {
         number: {name: [*row.per_class, row.class_iou, row.pixel_iou] for name, row in rows.items()}
         for number, rows in TABLES.items()
@@ -112,7 +112,7 @@ def test_published_numbers_are_those_that_were_checked():
 
 
 @pytest.mark.skipif(not PAPER.is_file(), reason="needs the paper's LaTeX source")
-def test_published_numbers_are_the_papers():
+def test_published_numbers_are_those_of_the_paper():
     source = re.sub(r"(?<!\\)%.*", "", PAPER.read_text())
     for (number, rows), label in zip(TABLES.items(), LABELS, strict=True):
         whole = source[: source.index(f"\\label{{tab:{label}}}")].rpartition("\\begin{tabular}")[2]

@@ -1,8 +1,7 @@
-"""Rates of views and of pairs.
+"""Rates of views and of pairs (I_zero, M_zero).
 
-Pairs are made by look-up in stored views and, in the same run, by rendering each texture anew: the texture is put on
-the mesh, and the mesh is rendered from both cameras. Rates differ between machines and from minute to minute: the
-ratios, with their spread, carry over.
+Pairs are made by look-up in stored views, and by rendering: the texture is uploaded to the mesh, and the mesh is
+rendered from both cameras. Rates depend on machine and time; the ratios, with their spread, carry over.
 """
 
 import itertools
@@ -31,9 +30,9 @@ from zerobev.scenes.indoor import generate_home
 from zerobev.scenes.readers import read_scene
 from zerobev.scenes.scene import Scene
 
-DENSITIES = (0.10, 0.15, 0.20, 0.25, 0.30)  #: shares of white texels (paper, Table 4)
+DENSITIES = (0.10, 0.15, 0.20, 0.25, 0.30)  #: fractions of white texels (paper, Table 4)
 WORKERS = (1, 2)
-_STORED = 24  # views that pairs are made of
+_STORED = 24  # views for pairs
 
 
 def home_folder(root: Path, number: int) -> Path:
@@ -44,13 +43,13 @@ def home_folder(root: Path, number: int) -> Path:
 
 
 def view_rates(folder: Path, setting: Scale, repeats: int, seconds: float) -> tuple[float, np.ndarray]:
-    """How fast one worker draws the complete views of a home.
+    """Rate of one worker that draws complete views of a home.
 
-    Returns the seconds from the home's folder to its first view, and (repeats, 2) views a second of wall time and of
-    processor time, in each of `repeats` stretches.
+    Returns the seconds from the home's folder to its first view, and (repeats, 2) views per second of wall time and of
+    processor time, measured for `seconds` each.
     """
     torch.set_num_threads(1)
-    _views(folder, setting)  # imports, and shaders that are compiled once a process
+    _views(folder, setting)  # imports, and shaders, compiled once per process
     start = time.perf_counter()
     _, source = _views(folder, setting)
     set_up = time.perf_counter() - start
@@ -65,9 +64,9 @@ def view_rates(folder: Path, setting: Scale, repeats: int, seconds: float) -> tu
 
 
 def measure_views(folders: list[Path], setting: Scale, repeats: int, seconds: float) -> dict[str, Any]:
-    """Views a second of one and of two workers, each with a home of its own.
+    """Views per second of one and of two workers, each with its own home.
 
-    The rate in processor time is that of one core that has nothing else to do.
+    The rate in processor time is that of one otherwise idle core.
     """
     measured: dict[str, Any] = {}
     for workers in WORKERS:
@@ -82,17 +81,17 @@ def measure_views(folders: list[Path], setting: Scale, repeats: int, seconds: fl
 
 
 def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> dict[str, Any]:
-    """Pairs a second by look-up and by rendering, of each kind of texture, in turns; and how many times faster.
+    """Pairs per second by look-up and by rendering, per kind of texture and interleaved, and their ratio.
 
-    The views are stored, and the textures on the mesh, before time is taken: what it takes to put one there is
-    measured by itself, since the paper lets one serve all views of a scene, and we draw another for every pair.
+    Views are stored and textures are uploaded before the measurement. The upload is measured separately: the paper
+    needs one per scene, a fresh texture per pair needs one per pair.
     """
     torch.set_num_threads(1)
     scene, source = _views(folder, setting)
     write_shard(shard, scene, (source.draw() for _ in range(_STORED)), setting.camera, setting.texture, 0)
     views = ViewSet([Shard(shard, setting.camera, setting.texture)])
     stored = [views.locate(index)[1] for index in range(len(views))]
-    banks = {f"synth {share:g}": noise_bank(setting, share) for share in DENSITIES}
+    banks = {f"synth {white:g}": noise_bank(setting, white) for white in DENSITIES}
     streams: dict[str, SampleStream] = {
         name: SynthSamples(views, bank, setting.camera, seed=0, batch=1) for name, bank in banks.items()
     }
@@ -104,36 +103,36 @@ def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> di
     rerenderer = Rerenderer(scene, setting.camera)
     looked_up: dict[str, list[float]] = defaultdict(list)
     rendered: dict[str, list[float]] = defaultdict(list)
-    put_on: list[float] = []
+    uploads: list[float] = []
     for _, (name, stream) in itertools.product(range(repeats), streams.items()):
         looked_up[name].append(_seconds_each(stored, stream.pair, 0, rng))
         if name in textures:
             rerenderer.wear(textures[name])
-            put_on.append(_seconds_each(stored[:1], lambda view: rerenderer.fpv(Pose(*view.pose))))
-            put_on[-1] -= _seconds_each(stored[:1], lambda view: rerenderer.fpv(Pose(*view.pose)))
+            first, again = (_seconds_each(stored[:1], lambda view: rerenderer.fpv(Pose(*view.pose))) for _ in range(2))
+            uploads.append(first - again)
         rendered[name].append(_seconds_each(stored, rerender, name in textures, rerenderer, setting.camera, rng))
     look_up_s, render_s = (np.mean(list(kinds.values()), axis=0) for kinds in (looked_up, rendered))
-    tuples = [1 / _seconds_each(range(_STORED), streams["synth 0.2"].sample) for _ in range(repeats)]
+    samples = [1 / _seconds_each(range(_STORED), streams["synth 0.2"].sample) for _ in range(repeats)]
     return {
         "looked_up": {name: spread(1 / np.array(seconds)) for name, seconds in looked_up.items()},
         "rendered": {name: spread(1 / np.array(seconds)) for name, seconds in rendered.items()},
-        "put_on_s": spread(put_on),
-        # all kinds together: as many pairs of each
+        "put_on_s": spread(uploads),
+        # of all kinds, with the same number of pairs of each
         "ratio": spread(render_s / look_up_s),
-        "tuples": spread(tuples),
+        "tuples": spread(samples),
     }
 
 
-def noise_bank(setting: Scale, share: float) -> TextureBank:
-    """A bank of the scale's size (32 tiles at most), its structures squares: a look-up takes no notice."""
-    texture = replace(setting.texture, white_fraction=share, tiles=min(setting.texture.tiles, 32))
+def noise_bank(setting: Scale, white_fraction: float) -> TextureBank:
+    """A bank of the scale's size, at most 32 tiles, of random squares; structures do not affect the look-up's time."""
+    texture = replace(setting.texture, white_fraction=white_fraction, tiles=min(setting.texture.tiles, 32))
     side = texture.tile_px // 16
-    squares = np.random.default_rng(0).random((texture.tiles, side, side)) < share
+    squares = np.random.default_rng(0).random((texture.tiles, side, side)) < white_fraction
     return TextureBank(squares.repeat(16, axis=1).repeat(16, axis=2), texture)
 
 
 def texture_images(scene: Scene, bank: TextureBank, rng: np.random.Generator) -> list[np.ndarray]:
-    """A texture of `bank` as it lies on the charts: one (rows, columns) bool image a chart."""
+    """A texture of `bank` on the charts of a scene: one (rows, columns) bool image per chart."""
     draw = bank.draw(rng, len(scene.chart_instance))
     return [
         bank.look_up(np.stack([np.full(image.shape, chart), *np.indices(image.shape)], axis=-1).astype(np.int16), draw)
@@ -144,7 +143,7 @@ def texture_images(scene: Scene, bank: TextureBank, rng: np.random.Generator) ->
 def rerender(
     view: View, textured: bool, rerenderer: Rerenderer, camera: CameraConfig, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pair (I_zero, M_zero) of the texture on the mesh at the pose of `view`; without one, of *Depth proj.*."""
+    """The pair (I_zero, M_zero) at the pose of `view`, of the texture on the mesh; not `textured`: of *Depth proj.*."""
     pose = Pose(*view.pose)
     zero, depth = rerenderer.fpv(pose)
     if textured:
@@ -154,13 +153,13 @@ def rerender(
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:
-    """Median, smallest and largest of the repeats."""
+    """Median, minimum and maximum of the repeats."""
     values = np.asarray(values, float)
     return {"median": float(np.median(values)), "low": float(values.min()), "high": float(values.max())}
 
 
 def report(setting: Scale, views: dict[str, Any], pairs: dict[str, Any]) -> dict[str, Any]:
-    """Everything measured, the figures of interest by themselves."""
+    """All measurements, with the figures of interest at the top level."""
     kinds, workers = len(pairs["looked_up"]), WORKERS[-1]
     look_up_s, render_s = (np.mean([1 / r["median"] for r in pairs[how].values()]) for how in ("looked_up", "rendered"))
     drawing_s = setting.scenes.views / (views[str(workers)]["median"] / workers)
@@ -169,12 +168,12 @@ def report(setting: Scale, views: dict[str, Any], pairs: dict[str, Any]) -> dict
         "views_per_s": views[str(workers)]["median"],
         "pairs_per_s": pairs["looked_up"]["synth 0.2"]["median"],
         "ratio_to_rerendering": pairs["ratio"]["median"],
-        # with another texture for every pair, as we have it
+        # with a fresh texture per pair, as in our training
         "ratio_to_fresh_rerendering": (render_s + pairs["put_on_s"]["median"]) / look_up_s,
-        # with the time that the views take, once for all kinds
+        # with the time of the views, once for all kinds
         "ratio_with_views": kinds * render_s / (1 / views["1"]["median"] + kinds * look_up_s),
         "tuples_per_s": pairs["tuples"]["median"],
-        # with homes read and prepared, and as many views of each as the scale has
+        # with the reading and preparation of homes, and the scale's number of views per home
         "generated_views_per_s": workers * setting.scenes.views / (views[str(workers)]["set_up_s"] + drawing_s),
         "by_workers": views,
         "by_kind": pairs,
@@ -182,7 +181,7 @@ def report(setting: Scale, views: dict[str, Any], pairs: dict[str, Any]) -> dict
 
 
 def table(measured: dict[str, Any]) -> list[str]:
-    """The report as lines of text: median, and the range of the repeats in brackets."""
+    """The report as lines of text: medians, with the range of the repeats in brackets."""
     pairs = measured["by_kind"]
     rows = [(f"complete views, workers: {workers}", rate) for workers, rate in measured["by_workers"].items()]
     rows += [(f"pairs by look-up, {name}", rate) for name, rate in pairs["looked_up"].items()]
@@ -202,7 +201,7 @@ def table(measured: dict[str, Any]) -> list[str]:
 
 
 def measure(setting: Scale, repeats: int, seconds: float) -> dict[str, Any]:
-    """Everything, in homes that are generated for it: `repeats` stretches, those of views `seconds` long."""
+    """All measurements, in homes generated for them, `repeats` times; views for `seconds` each."""
     with tempfile.TemporaryDirectory() as folder:
         folders = [home_folder(Path(folder), number) for number in range(max(WORKERS))]
         views = measure_views(folders, setting, repeats, seconds)
@@ -211,7 +210,7 @@ def measure(setting: Scale, repeats: int, seconds: float) -> dict[str, Any]:
 
 
 def _views(folder: Path, setting: Scale) -> tuple[Scene, ViewSource]:
-    """A home and the source of its views, after the first of them."""
+    """A home and the source of its views, after the first view."""
     scene = read_scene(folder)
     source = ViewSource(scene, setting.camera, setting.texture, np.random.default_rng(0))
     source.draw()

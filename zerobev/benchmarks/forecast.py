@@ -1,8 +1,8 @@
-"""Forecast of the time, memory and disk that a reproduction takes on this machine.
+"""Forecast of the time, memory and disk of a reproduction on this machine.
 
-Reads what is recorded; writes nothing. Views of one home and samples of two trainings are measured, in about a minute;
-the rest is multiplication. The figures are estimates for one process and one device: every network is assumed to cost
-as much as that of row (c), and drawing the figures is left out.
+Reads records and caches; prints the forecast. Views of one home and samples of two trainings are measured, in about a
+minute, and multiplied. The figures are estimates for one process and one device: all networks count as row (c), and
+figures of the report count nothing.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
 from zerobev.common.errors import InputError
-from zerobev.config import SCALES, SPLITS, Scale
+from zerobev.config import SPLITS, Scale
 from zerobev.data.generate import shard_path
 from zerobev.data.samples import SynthSamples, ViewSet, as_float, collate, semantic_sample
 from zerobev.data.shards import Shard, write_shard
@@ -30,7 +30,7 @@ from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.provenance import peak_memory_mb
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.runs import SEEDS, Run
-from zerobev.experiments.workspace import Workspace
+from zerobev.experiments.workspace import Workspace, add_workspace_arguments
 from zerobev.models import build
 from zerobev.models.depth import DepthNet
 from zerobev.scenes.readers import read_scene
@@ -38,61 +38,62 @@ from zerobev.training.depth import DepthSamples, depth_objective
 from zerobev.training.loader import Source, gpu_workers, model_inputs, moved
 from zerobev.training.train import Objective, dice_objective, training_accelerator
 
-_VIEWS, _SECONDS = 4, 4.0  # views that are stored and trained on; seconds in which they are counted
-_SAMPLES = {"cpu": 2, "cuda": 8}  # of a pass; with fewer a GPU has little to do
-_COPIES = 5  # of the weights: themselves, their gradient, Adam's two moments, the best so far
+_VIEWS = 4  # for training
+_SECONDS = 4.0  # in which views are counted
+_SAMPLES = {"cpu": 2, "cuda": 8}  # of a pass; fewer do not fill a GPU
+_COPIES = 5  # of the weights: the weights, their gradient, Adam's two moments, the best weights
 
 
 @dataclass(frozen=True)
 class Network:
-    """What a network takes of this machine."""
+    """Cost of a network on this machine."""
 
     weight_bytes: int
-    process_bytes: float  #: of a process that does not train yet
-    sample_bytes: float  #: kept for the backward pass, of each sample
-    train_s: float  #: of a sample: drawing it, forward and backward pass
-    test_s: float  #: forward pass of a view in the test
+    process_bytes: float  #: of the process before training
+    sample_bytes: float  #: saved for the backward pass, per sample
+    train_s: float  #: per sample: drawing, forward and backward pass
+    test_s: float  #: per view in the test: forward pass
 
     def memory_bytes(self, batch: int) -> float:
-        """Of a training: process, weights, optimiser, and what is kept for a backward pass."""
+        """Memory of a training: process, weights, optimiser, and tensors saved for the backward pass."""
         return self.process_bytes + _COPIES * self.weight_bytes + batch * self.sample_bytes
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What there is to do at a scale, and what it takes."""
+    """The work at a scale, and its cost."""
 
     scale: Scale
-    homes: dict[str, int]  #: by split
+    homes: dict[str, int]  #: per split
     networks: int
-    left: dict[str, int]  #: homes, networks and estimators without a shard, a record, weights
-    there_bytes: int  #: of views, depth and weights
-    view_bytes: float  #: compressed
-    view_s: float  #: of one core
+    left: dict[str, int]  #: missing: homes without a shard, networks and estimators without a record
+    there_bytes: int  #: existing views, depth and weights
+    view_bytes: float  #: per view, compressed
+    view_s: float  #: per view, on one core
     network: Network  #: of row (c)
     estimator: Network
 
     @property
     def views(self) -> int:
-        """Of all homes."""
+        """Number of views of all homes."""
         return sum(self.homes.values()) * self.scale.scenes.views
 
     @property
     def disk_bytes(self) -> dict[str, float]:
-        """Of a finished reproduction: estimated depth is float16, every network is kept twice, one has a checkpoint."""
+        """Disk of a finished reproduction: depth in float16, two files per network, one checkpoint."""
         depth = self.views * 2 * self.scale.camera.fpv_px**2
         weights = (2 * self.networks + _COPIES - 1) * self.network.weight_bytes
         return {"views": self.views * self.view_bytes, "depth": depth, "weights": weights}
 
     @property
     def needed_bytes(self) -> dict[str, float]:
-        """Of the disk, beside what is there, and for the training that takes the most memory."""
+        """Disk beyond the existing files, and memory of the largest training."""
         network, estimator = self.network, self.estimator
         memory = max(network.memory_bytes(self.scale.train.batch), estimator.memory_bytes(self.scale.depth.batch))
         return {"free disk": max(sum(self.disk_bytes.values()) - self.there_bytes, 0), "memory": memory}
 
     def hours(self, workers: int) -> dict[str, float]:
-        """Of what is left to do."""
+        """Hours of the missing work; `workers` draw the views."""
         scale, left = self.scale, self.left
         trained, estimated = (config.steps * config.batch for config in (scale.train, scale.depth))
         tested = self.homes["test"] * (scale.test_views or scale.scenes.views)
@@ -105,13 +106,13 @@ class Forecast:
         return {name: value / 3600 for name, value in seconds.items()}
 
     def check(self, there: Mapping[str, float]) -> None:
-        """Raise `InputError` where there is less than needed of disk or memory."""
+        """Raise `InputError` if disk or memory is too small."""
         for what, needed in self.needed_bytes.items():
             if needed > there[what]:
                 raise InputError(f"scale {self.scale.name}: expected {_gb(needed)} of {what}, found {_gb(there[what])}")
 
     def table(self, there: Mapping[str, float], workers: int) -> str:
-        """All of it, as text."""
+        """The forecast as text."""
         scale, needed, hours = self.scale, self.needed_bytes, self.hours(workers)
         rows = {
             "homes": ", ".join(f"{number} {part}" for part, number in self.homes.items()),
@@ -128,7 +129,7 @@ class Forecast:
 
 
 def forecast(workspace: Workspace) -> Forecast:
-    """Measure one of each, and count what there is to do."""
+    """Measure a view and two networks, and count the work."""
     scale, folders, depth = workspace.scale, workspace.split, DepthPretraining(workspace)
     homes, shards = {split: folders.of(split) for split in SPLITS}, workspace.views_folder
     missing = [home for split, of in homes.items() for home in of if not shard_path(home, shards / split).exists()]
@@ -136,7 +137,7 @@ def forecast(workspace: Workspace) -> Forecast:
     left = {
         "homes": len(missing),
         "networks": sum(run.recorded() is None for run in networks),
-        "estimators": int(not depth.is_recorded),
+        "estimators": int(depth.recorded() is None),
     }
     there = [path for of in (shards, workspace.cache / depth.key, workspace.runs) for path in of.rglob("*")]
     return Forecast(
@@ -150,12 +151,12 @@ def forecast(workspace: Workspace) -> Forecast:
 
 
 def measure(scale: Scale, home: Path | None) -> dict[str, Any]:
-    """What a view and two networks take, fields of a `Forecast`; of a home in HM3DSem layout, or of a generated one."""
+    """Cost of a view and of two networks, fields of `Forecast`; `home` in HM3DSem layout, None: a generated home."""
     threads, samples = torch.get_num_threads(), _SAMPLES[training_accelerator().device.type]
     with tempfile.TemporaryDirectory() as scratch:
         folder, path = home or home_folder(Path(scratch), 0), Path(scratch) / "views.h5"
         set_up_s, rates = view_rates(folder, scale, 1, _SECONDS)
-        torch.set_num_threads(threads)  # of the trainings; each worker that draws views has one
+        torch.set_num_threads(threads)  # as in training; `view_rates` uses one
         scene = read_scene(folder)
         source = ViewSource(scene, scale.camera, scale.texture, np.random.default_rng(0))
         drawn = [source.draw() for _ in range(_VIEWS)]
@@ -183,27 +184,27 @@ def _network(net: nn.Module, objective: Objective, data: Source, samples: int, t
     batch = moved(data.batch(0, 0, 1), device)
     drawn_s = _seconds(lambda: data.batch(1, 0, 1)) / samples
     process = 2**20 * peak_memory_mb() if device.type == "cpu" else 0
-    kept = saved_bytes(lambda: objective(net, batch).total, net)
+    saved = saved_bytes(lambda: objective(net, batch).total, net)
     _, passed_s = (_seconds(lambda: objective(net, batch).total.backward()) / samples for _ in range(2))
-    # beside a GPU, workers draw the batches to come
+    # with a GPU, workers draw the next batches meanwhile
     train_s = max(drawn_s / gpu_workers(), passed_s) if device.type == "cuda" else drawn_s + passed_s
     net.eval()
     with torch.inference_mode():
         test_s = _seconds(lambda: net(*(image.to(device) for image in test)))
-    return Network(weights, process, kept / samples, train_s, test_s)
+    return Network(weights, process, saved / samples, train_s, test_s)
 
 
 def saved_bytes(forward: Callable[[], Tensor], net: nn.Module) -> int:
-    """What autograd keeps of a forward pass for the backward one, beside the weights; storage that is shared once."""
-    kept: dict[int, int] = {}
+    """Memory that autograd saves for the backward pass, without the weights; shared storage counts once."""
+    saved: dict[int, int] = {}
 
     def note(tensor: Tensor) -> Tensor:
-        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-        return tensor.detach()  # the tensor itself would keep the graph alive
+        saved[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor.detach()  # not the tensor, which would keep the graph alive
 
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        _loss = forward()  # as long as it lives, what it keeps does
-    return sum(kept.values()) - sum(kept.get(p.untyped_storage().data_ptr(), 0) for p in net.parameters())
+        _loss = forward()  # the reference keeps the saved tensors alive
+    return sum(saved.values()) - sum(saved.get(p.untyped_storage().data_ptr(), 0) for p in net.parameters())
 
 
 def _seconds(run: Callable[[], Any]) -> float:
@@ -220,8 +221,7 @@ def _gb(size: float) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev plan`."""
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    add_workspace_arguments(parser)
     parser.add_argument("--textures", type=Path, metavar="DIR", help="texture images for the zero-shot stream")
     parser.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="values, such as train.steps=2400"
@@ -229,7 +229,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the forecast; an `InputError` if this machine has less disk or memory than needed."""
+    """Print the forecast. Raises `InputError` if disk or memory of this machine is too small."""
     if options.textures:
         os.environ["ZEROBEV_TEXTURES"] = str(options.textures.resolve())
     workspace = Workspace(options.scale, options.scenes, settings=options.set)

@@ -1,8 +1,8 @@
-"""Measure the cost of data, of a training step and of an inference.
+"""Measure the cost of data, of a training step and of inference.
 
-Reads homes and views (made first if they are missing); prints a table and writes everything with `--json`. All settings
-are measured in turns and with their spread, so that machine noise hits all alike. Milliseconds belong to one machine at
-one time; ratios carry over: to the machine's own peak of matrix products, and between settings.
+Reads homes and views (made first if they are missing); prints a table and writes all measurements with `--json`.
+Settings are interleaved, so that machine noise hits all alike, and reported with their spread. Milliseconds depend on
+machine and time; ratios carry over: to the machine's peak of matrix products, and between settings.
 """
 
 import argparse
@@ -29,14 +29,15 @@ from zerobev.experiments.records import recorded
 from zerobev.experiments.workspace import Workspace
 from zerobev.models import BevModel, build
 
-MODALITIES = (1, 8, 40)  #: zero-shot images of one photograph
-ROWS = ("c", "e", "f")  #: that inference is measured of
-_SIZES = (0.5, 1.0, 2.0)  # of images and of maps, times the scale's
+MODALITIES = (1, 8, 40)  #: zero-shot images per RGB image
+ROWS = ("c", "e", "f")  #: of which inference is measured
+REPEATS = 9  #: of the recorded benchmark
+_SIZES = (0.5, 1.0, 2.0)  # of images and of maps, relative to the scale's
 _SCENES = (1, 4)
 
 
 def measure_inference(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
-    """Milliseconds for K images of one photograph, in one call and in K calls, of the networks `ROWS`."""
+    """Milliseconds of the networks `ROWS` for K zero-shot images of one RGB image, in one call and in K calls."""
     measured = {}
     for row in ROWS:
         net = build(row, setting.camera, setting.model).to(machine.device).eval()
@@ -60,9 +61,9 @@ def measure_inference(setting: Scale, machine: Machine, repeats: int) -> dict[st
 
 
 def measure_sizes(setting: Scale, machine: Machine, repeats: int) -> dict[str, dict[str, Any]]:
-    """How a step grows with the image, with the map, and the drawing of a batch with the number of scenes.
+    """Time of a step by size of image and of map, and time of drawing a batch by number of scenes.
 
-    Ratios to the scale's own size, or to one scene.
+    Each with its ratio to the scale's own size, or to one scene.
     """
     camera = setting.camera
     cameras = {f"image {s:g}x": replace(camera, fpv_px=round(s * camera.fpv_px)) for s in _SIZES}
@@ -84,7 +85,7 @@ def measure_sizes(setting: Scale, machine: Machine, repeats: int) -> dict[str, d
 
 
 def measure_memory(setting: Scale) -> dict[str, float]:
-    """Peak memory in MB of fresh processes: that import, train five steps, project 40 images, draw batches."""
+    """Peak memory of new processes, MB: after imports, five training steps, 40 projected images, 20 batches."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         parts = ("imports", "training", "inference", "data")
         return {part: pool.submit(_peak_of, part, setting.name).result() for part in parts}
@@ -120,7 +121,7 @@ def _next_batch(stream: SynthSamples, steps: Iterator[int]) -> None:
 
 
 def measure(setting: Scale, repeats: int) -> dict[str, Any]:
-    """Everything, as plain data."""
+    """All measurements, as plain data."""
     machine = Machine()
     training = measure_training(setting, machine, repeats)
     paper = measure_paper_step(machine, max(repeats // 3, 1))
@@ -141,7 +142,7 @@ def measure(setting: Scale, repeats: int) -> dict[str, Any]:
 
 
 def table(measured: dict[str, Any]) -> list[str]:
-    """The figures of interest as lines of text: medians, and the range of the repeats in brackets."""
+    """The figures of interest as lines of text: medians, with the range of the repeats in brackets."""
     training = measured["training"]
     lines = [f"scale {measured['scale']} on {measured['device']}: median [smallest, largest] of the repeats, ms"]
     lines += [f"generation, {line}" for line in generation.table(measured["generation"])[1:]]
@@ -149,33 +150,35 @@ def table(measured: dict[str, Any]) -> list[str]:
         for name, ms in found["milliseconds"].items():
             lines.append(f"{f'{what}, {name}':<34}{ms['median']:>9.1f}  [{ms['low']:.1f}, {ms['high']:.1f}]")
             if name in found["share_of_peak"]:
-                of = [100 * found[share][name] for share in ("share_of_peak", "share_of_roofline")]
-                lines[-1] += f"  {of[0]:5.1f} % of the peak, {of[1]:5.1f} % of the roofline"
+                peak, roofline = (100 * found[key][name] for key in ("share_of_peak", "share_of_roofline"))
+                lines[-1] += f"  {peak:5.1f} % of the peak, {roofline:5.1f} % of the roofline"
     for workers, waiting in training["waiting_share"].items():
         lines.append(f"{f'waiting for data, workers: {workers}':<34}{100 * waiting['share']:>9.1f} %")
     for row, found in measured["inference"].items():
-        shares = ", ".join(f"{k}: {ratio:.2f}" for k, ratio in found["shared_over_separate"].items())
-        lines.append(f"inference ({row}): 8 images take {found['k8_over_k1']:.2f} x one; one call / K calls {shares}")
+        ratios = ", ".join(f"{k}: {ratio:.2f}" for k, ratio in found["shared_over_separate"].items())
+        lines.append(f"inference ({row}): 8 images take {found['k8_over_k1']:.2f} x one; one call / K calls {ratios}")
     lines += [f"{name:<34}{one['ratio']:>9.2f} x" for name, one in measured["sizes"].items()]
     return lines + [f"memory, {name:<26}{peak:>9.0f} MB" for name, peak in measured["memory_mb"].items()]
 
 
 def recorded_benchmark(workspace: Workspace) -> dict[str, Any]:
-    """The measurements of a report, `benchmark.json`: read where they are recorded, else taken now (some minutes)."""
+    """The measurements of a report, recorded in `benchmark.json`; made now if they are missing (some minutes)."""
     config = {"version": versions.BENCHMARK, "scale": workspace.scale.name}
     path = workspace.reports / "benchmark.json"
-    return recorded(path, "benchmark", config, lambda: measure(workspace.scale, repeats=9))
+    return recorded(path, "benchmark", config, lambda: measure(workspace.scale, REPEATS), Machine().device.type)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev benchmark`."""
     parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--repeats", type=int, default=9, help="the median of these is taken (default: 9)")
+    parser.add_argument(
+        "--repeats", type=int, default=REPEATS, help=f"the median of these is taken (default: {REPEATS})"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write everything measured to FILE")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure, print the table, and write everything with `--json`."""
+    """Measure, print the table, and write all measurements with `--json`."""
     measured = measure(scale(options.scale), options.repeats)
     for line in table(measured):
         print(line)

@@ -1,8 +1,8 @@
-"""What a training step costs, and what keeps it from being faster; part of `python -m zerobev.benchmarks.run`.
+"""Cost of a training step and its bounds; part of `zerobev benchmark`.
 
-Milliseconds belong to a machine and a minute. Beside them stand two measures of what the same machine could do in the
-same minutes: the rate of a large matrix product, and a *roofline* (Williams et al. 2009), for which each operation
-takes its products at that rate or its bytes at the rate of a large copy, whichever is longer.
+Two bounds are measured at the same time on the same machine: the rate of a large matrix product, and a *roofline*
+(Williams et al. 2009). On the roofline, an operation takes the longer of two times: its products at that rate, or its
+bytes at the rate of a large copy.
 """
 
 import itertools
@@ -26,31 +26,31 @@ from zerobev.training.loader import Source, batches
 from zerobev.training.losses import zero_bev_loss
 from zerobev.training.precision import computes_bfloat16
 
-_MATMUL = 2048  # side of the matrices whose product is the machine's peak
-_COPIED = 2**24  # numbers, float32, whose copy is the machine's bandwidth
+_MATMUL = 2048  # side of the matrices in the product that gives the peak
+_COPIED = 2**24  # float32 numbers in the copy that gives the bandwidth
 _WAITED = 20  # steps in which waiting for data is measured
-_PAPER_SAMPLES = 2  # of a step at the paper's sizes: 16 take more memory than a laptop has
-#: Operations that reserve memory and do not touch it.
+_PAPER_SAMPLES = 2  # of a step at the paper's sizes; 16 exceed the memory of a laptop
+#: Operations that reserve memory without access.
 _RESERVING = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided")
 
 Run = Callable[[], Any]
 
 
 class Machine:
-    """The device that everything is measured on, and how time is taken there."""
+    """The device of all measurements, and its clock."""
 
     def __init__(self) -> None:
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.bfloat16 = computes_bfloat16(self.device.type)
 
     def autocast(self) -> torch.autocast:
-        """As in training."""
+        """Autocast as in training."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def milliseconds(self, runs: dict[str, Run], repeats: int) -> dict[str, dict[str, float]]:
-        """Spread of the time of each run. They take turns, so that a slow minute is everybody's."""
+        """Spread of the time per run; interleaved, so that machine noise hits all alike."""
         times: dict[str, list[float]] = {name: [] for name in runs}
-        for repeat in range(repeats + 1):  # the first one warms up
+        for repeat in range(repeats + 1):  # the first is a warm-up
             for name, run in runs.items():
                 start = time.perf_counter()
                 run()
@@ -60,12 +60,12 @@ class Machine:
         return {name: spread(values) for name, values in times.items()}
 
     def finish(self) -> None:
-        """Wait for what was started on a GPU."""
+        """Wait for the end of all work on a GPU."""
         if self.device.type == "cuda":
             torch.cuda.synchronize()
 
     def batch(self, camera: CameraConfig, samples: int, images: int = 1) -> dict[str, Tensor]:
-        """Random tensors of the form of `data.samples`; what is in them takes no time."""
+        """Random tensors with the shapes of `data.samples`; their content does not affect the time."""
         side, cells = camera.fpv_px, camera.bev_px
         shapes = {"rgb": (3, side), "zero": (images, side), "depth": (1, side), "target": (images, cells)}
         shapes |= {"aux": (2, cells), "fov": (1, cells)}
@@ -74,7 +74,7 @@ class Machine:
 
 
 def training_step(net: BevModel, batch: dict[str, Tensor], machine: Machine) -> Run:
-    """One step as `training.train` takes it: forward, loss, backward, Adam."""
+    """One step as in `training.train`: forward, loss, backward, Adam."""
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-4, fused=True)
     net.train()
 
@@ -89,7 +89,7 @@ def training_step(net: BevModel, batch: dict[str, Tensor], machine: Machine) -> 
 
 
 def blocks(net: ZeroBEV, batch: dict[str, Tensor], machine: Machine) -> dict[str, Run]:
-    """Forward and backward of each block of the network by itself, on the maps that it gets in a step."""
+    """Forward and backward pass of each block of the network alone, on its inputs in a step."""
     with machine.autocast():
         rgb = net.backbone(batch["rgb"])
         fpv = net.fpv_maps(rgb, batch["zero"])
@@ -116,14 +116,14 @@ def blocks(net: ZeroBEV, batch: dict[str, Tensor], machine: Machine) -> dict[str
 
 
 def flops(run: Run) -> int:
-    """Floating-point operations of matrix products and convolutions, forward and backward."""
+    """Number of floating-point operations of matrix products and convolutions, forward and backward."""
     with FlopCounterMode(display=False) as counter:
         run()
     return counter.get_total_flops()
 
 
 class _Operations(TorchDispatchMode):
-    """Notes the products and the bytes of every operation below it."""
+    """Collects floating-point operations and bytes of each operation in its context."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -139,12 +139,12 @@ class _Operations(TorchDispatchMode):
 
 
 def _bytes_moved(operation: Any, inputs: list[Any], outputs: list[Any]) -> int:
-    """The least that an operation reads and writes: each tensor once, and nothing where it makes a view."""
+    """Minimum of bytes that an operation reads and writes: each tensor once, 0 for a view."""
     read, written = ([t for t in of if isinstance(t, Tensor)] for of in (inputs, outputs))
     makes_views = not operation._schema.is_mutable and set(map(_storage, written)) <= set(map(_storage, read))
     if makes_views or operation.overloadpacket.__name__ in _RESERVING:
         return 0
-    # what is written in place is read there, too: counted once, it is the least
+    # a tensor that is changed in place counts once
     return sum({t.data_ptr(): min(t.nbytes, t.untyped_storage().nbytes()) for t in (*read, *written)}.values())
 
 
@@ -153,19 +153,19 @@ def _storage(tensor: Tensor) -> int:
 
 
 def min_milliseconds(run: Run, peak_tflops: float, bandwidth_gbs: float) -> float:
-    """The roofline of `run`: what its operations take if each is held up by products or by memory alone.
+    """Milliseconds of `run` on the roofline: the sum over operations of the longer of products and memory access.
 
-    Bytes that an operation finds in a cache are counted as if it did not: small operations can be faster.
+    Bytes in a processor cache count as memory access, so small operations can be faster.
     """
-    with _Operations() as below:
+    with _Operations() as operations:
         run()
-    return sum(max(count / peak_tflops / 1e9, size / bandwidth_gbs / 1e6) for count, size in below.noted)
+    return sum(max(count / peak_tflops / 1e9, size / bandwidth_gbs / 1e6) for count, size in operations.noted)
 
 
 def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
-    """A step of (c), its blocks, and the drawing of its batch; and what share of the peak and roofline they reach.
+    """Time of a step of (c), of its blocks and of drawing its batch, with the fractions of peak and roofline.
 
-    The peak is that of the matrix product of two matrices of 2048 x 2048, in bfloat16 where training computes in it.
+    The peak is the rate of a product of 2048 x 2048 matrices, in bfloat16 if training uses it.
     """
     net = build("c", setting.camera, setting.model).to(machine.device)
     assert isinstance(net, ZeroBEV)  # as row (c) is
@@ -174,14 +174,14 @@ def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str
     numbers = itertools.count()
     drawing = {"batch": lambda: stream.batch(next(numbers))}
     measured = against_the_machine({"step": step} | blocks(net, batch, machine), drawing, machine, repeats)
-    waiting = {str(workers): waiting_share(net, stream, machine, workers) for workers in (0, 1)}
+    waiting = {str(workers): waiting_fraction(net, stream, machine, workers) for workers in (0, 1)}
     return measured | {"waiting_share": waiting}
 
 
 def measure_paper_step(machine: Machine, repeats: int) -> dict[str, Any]:
-    """A step of (c) at the paper's sizes, of two samples, without dropout; and with it, as the paper has it.
+    """A step of (c) at the paper's sizes with two samples, without dropout and with the paper's dropout.
 
-    Torch draws dropout's random numbers one by one on a CPU, which is neither product nor memory.
+    On a CPU, torch draws dropout's random numbers one by one; this time is on neither side of the roofline.
     """
     paper = scale("paper")
     net = build("c", paper.camera, paper.model).to(machine.device)
@@ -201,17 +201,21 @@ def _with_dropout(step: Run, net: BevModel, probability: float) -> None:
 
 
 def against_the_machine(runs: dict[str, Run], others: dict[str, Run], machine: Machine, repeats: int) -> dict[str, Any]:
-    """Time of runs and others, in turns with a matrix product and a copy, and what the runs reach of these two."""
+    """Time of `runs` and `others`, interleaved with a matrix product and a copy; for `runs`, fractions of these bounds.
+
+    Returns `milliseconds` with their spread, `gigaflops`, the bounds, and per run: `share_of_peak`, the same on the
+    roofline (`roofline_share_of_peak`), and `share_of_roofline`.
+    """
     matrix = torch.rand(_MATMUL, _MATMUL, device=machine.device)
     matrix = matrix.bfloat16() if machine.bfloat16 else matrix
     source, target = torch.rand(2, _COPIED, device=machine.device)
     rates: dict[str, Run] = {"matrix product": lambda: matrix @ matrix, "copy": lambda: target.copy_(source)}
     milliseconds = machine.milliseconds(rates | runs | others, repeats)
-    # medians, as of all else: a machine that is shared has moments in which a product is thrice as fast, a step is not
+    # medians: on a shared machine, single products can be three times as fast, whole steps cannot
     peak, best = (2 * _MATMUL**3 / milliseconds["matrix product"][of] / 1e9 for of in ("median", "low"))
     bandwidth = 2 * 4 * _COPIED / milliseconds["copy"]["median"] / 1e6
     operations = {name: flops(run) for name, run in runs.items()}
-    least = {name: min_milliseconds(run, peak, bandwidth) for name, run in runs.items()}
+    roofline = {name: min_milliseconds(run, peak, bandwidth) for name, run in runs.items()}
     return {
         "milliseconds": milliseconds,
         "gigaflops": {name: count / 1e9 for name, count in operations.items()},
@@ -219,22 +223,21 @@ def against_the_machine(runs: dict[str, Run], others: dict[str, Run], machine: M
         "best_tflops": best,
         "bandwidth_gbs": bandwidth,
         "share_of_peak": {n: count / milliseconds[n]["median"] / 1e9 / peak for n, count in operations.items()},
-        # what they would reach if nothing but products and memory took time
-        "roofline_share_of_peak": {n: count / least[n] / 1e9 / peak for n, count in operations.items()},
-        "share_of_roofline": {name: least[name] / milliseconds[name]["median"] for name in runs},
+        "roofline_share_of_peak": {n: count / roofline[n] / 1e9 / peak for n, count in operations.items()},
+        "share_of_roofline": {name: roofline[name] / milliseconds[name]["median"] for name in runs},
     }
 
 
-def waiting_share(net: BevModel, stream: Source, machine: Machine, workers: int) -> dict[str, float]:
-    """The share of a training's time in which it waits for its batches, and the milliseconds of a step with both."""
+def waiting_fraction(net: BevModel, stream: Source, machine: Machine, workers: int) -> dict[str, float]:
+    """Fraction of training time spent waiting for batches (`share`), and `milliseconds` per step with waiting."""
     drawn = batches(stream, range(_WAITED + 1), machine.device, workers=workers)
-    batch = dict(next(drawn))  # which waits for the workers to start
+    batch = dict(next(drawn))  # after the start of the workers
     step = training_step(net, batch, machine)
     waited, ended = 0.0, time.perf_counter()
     started = ended
-    for coming in drawn:
+    for new in drawn:
         waited += time.perf_counter() - ended
-        batch.update(coming)
+        batch.update(new)
         step()
         machine.finish()
         ended = time.perf_counter()

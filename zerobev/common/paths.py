@@ -28,3 +28,8 @@ def zerobev_home() -> Path:
             raise InputError(f"ZEROBEV_HOME: expected a folder, found a file at {folder}")
         return folder
     return checkout() or Path.cwd()
+
+
+def report_name(scale: str, scenes: Path | None) -> str:
+    """Name of the folder in `reports/`: the scale's name, or `<scale>-<folder>-scenes` for scenes from a folder."""
+    return scale if scenes is None else f"{scale}-{scenes.resolve().name}-scenes"

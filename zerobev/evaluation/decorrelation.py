@@ -1,12 +1,12 @@
-"""Decorrelation, measured: what a scene tells about M_zero when I_zero is not shown (paper, Section 3.2, P3).
+"""Decorrelation, measured: the information of a scene about M_zero without I_zero (paper, Section 3.2, P3).
 
-Where M_zero can be told from the photograph, a network may learn to read it there and to ignore I_zero. What the
-photograph shows is held as a *descriptor*: one integer a cell of the map, such as the class of what is there, or its
-colour. Two numbers say how much a descriptor tells about a binary map: their mutual information, in bits, and the
-ROC-AUC of the predictor that knows, for each value of the descriptor, how often it was white in other views.
+If the RGB image predicts M_zero, a network may learn to ignore I_zero. A *descriptor* stands for the content of the
+image: one integer per map cell, such as its class or its colour. Two numbers measure the dependence of a binary map on
+a descriptor: their mutual information, in bits, and the ROC-AUC of a predictor that knows the fraction of white cells
+per value of the descriptor in other views.
 
-Cells of a view wear one texture, and so do the views of a scene whose texture is kept: neither are independent
-samples. What counts as chance is hence found by exchanging the maps of whole *groups* of views.
+All cells of a view have one texture, and with one texture per scene so have all views of the scene: they are not
+independent samples. The null distribution therefore exchanges the maps of whole *groups* of views.
 """
 
 from dataclasses import dataclass
@@ -17,36 +17,37 @@ from scipy import ndimage
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
+from zerobev.evaluation.metrics import INTERVAL
 from zerobev.geometry.projection import cells_of_pixels
 
-#: Steps of each colour channel that `colour_of_cells` tells apart.
+#: Number of steps per colour channel in `colour_of_cells`.
 _SHADES = 4
-#: Distances from the edge of a class that `shape_of_cells` tells apart, cells.
-_DEEPEST = 4
+#: Number of distances from the edge of a class in `shape_of_cells`.
+_DISTANCES = 4
 
 
 @dataclass(frozen=True)
 class Measure:
-    """How much a descriptor tells about maps, and how much it tells about the maps of other views."""
+    """The dependence of maps on a descriptor, and its null distribution."""
 
-    own: float  #: about each view's own map
-    exchanged: float  #: about the map of another view, which is chance
-    differences: np.ndarray  #: (draws,) own - exchanged if a coin decides for each pair which of the two is which
+    own: float  #: with each view's own map
+    exchanged: float  #: with the map of another view: chance
+    differences: np.ndarray  #: (draws,) own - exchanged, with the two swapped at random for each pair of groups
 
     @property
     def excess(self) -> float:
-        """What is not chance; 0 on average if maps do not depend on the descriptor."""
+        """own - exchanged; 0 on average if maps do not depend on the descriptor."""
         return self.own - self.exchanged
 
     @property
     def p_value(self) -> float:
         """Probability of at least this excess if maps do not depend on the descriptor."""
-        # not "differences >= excess": a measure that is undefined is no evidence
+        # not "differences >= excess": NaN must count as no evidence
         return float((1 + np.count_nonzero(~(self.differences < self.excess))) / (1 + len(self.differences)))
 
-    def chance(self, level: float = 0.9) -> tuple[float, float]:
-        """Interval that holds `own` with probability `level` if maps do not depend on the descriptor."""
-        low, high = np.quantile(self.differences, [(1 - level) / 2, (1 + level) / 2])
+    def chance(self) -> tuple[float, float]:
+        """Interval that holds `own` with a probability of 90 % if maps do not depend on the descriptor."""
+        low, high = np.quantile(self.differences, INTERVAL)
         return self.exchanged + float(low), self.exchanged + float(high)
 
 
@@ -60,30 +61,34 @@ def dependence(
 ) -> tuple[Measure, Measure]:
     """Mutual information in bits, and AUC of the prediction, of `maps` given `descriptor`.
 
-    maps: (V, M, M) bool; descriptor: (V, M, M) int >= 0 (negative: unknown); valid: (V, M, M) bool, the cells that
-    count; groups: (V,) int, equal for views whose textures are not independent of each other: the number of the view
-    itself for a fresh texture a view, the number of the scene for one texture a scene.
+    maps: (V, M, M) bool
+    descriptor: (V, M, M) int >= 0; negative: unknown
+    valid: (V, M, M) bool, the cells that count
+    groups: (V,) int, equal for views with dependent textures: the index of the view if each view has a fresh texture,
+        the index of the scene for one texture per scene
+    draws: number of draws of the null distribution
 
-    Groups are paired at random, and each view with one of the other group; cells count where both views are valid,
-    and the two exchange their maps. If maps are independent of what their views show, a pair is as likely either way:
-    a draw of the null distribution lets a coin decide for each pair of groups. Maps stay in their frame: that M_zero
-    and scenes both vary from near to far is no dependence yet. Any other trace of geometry is one: a map that is black
-    where the camera does not see depends on the scene, though its white says nothing of it. The predictor is fitted
-    on every other pair of groups and scored on the rest, then the other way round. Information is the plug-in estimate,
-    less its bias as the same two halves of the data show it: 0 on average for maps that are independent, whatever ties
-    the cells of one view together, where one texture ends at the edge of an object, say; it may fall below 0.
+    Groups are paired at random, and each view with a view of the other group. The two exchange their maps; cells that
+    are valid in both count. If maps are independent of the content of their views, both assignments are equally likely:
+    a draw of the null distribution flips a coin for each pair of groups. Maps keep their frame, so a variation of both
+    M_zero and scenes from near to far is no dependence. Any other trace of geometry is one: a map that is black outside
+    the visible area depends on the scene.
+
+    The predictor is fitted on every other pair of groups and scored on the rest, then the other way round. Information
+    is the plug-in estimate minus its bias, which the same two halves of the data show. It is 0 on average for
+    independent maps, even if the cells of a view depend on each other, and may be negative.
 
     Raises `InputError` for arrays of different shapes, and for less than four groups.
     """
     if not maps.shape == descriptor.shape == valid.shape or groups.shape != maps.shape[:1]:
         shapes = [array.shape for array in (maps, descriptor, valid, groups)]
-        raise InputError(f"maps: expected descriptor and valid of the same shape and a group a view, found {shapes}")
+        raise InputError(f"maps: expected descriptor and valid of the same shape and a group per view, found {shapes}")
     members = [np.flatnonzero(groups == group) for group in rng.permutation(np.unique(groups))]
     if len(members) < 4:
         raise InputError(f"groups: expected at least 4, found {len(members)}")
     values = int(descriptor.max()) + 1
     known = valid & (descriptor >= 0)
-    own, exchanged = [], []  # a contingency table a pair of groups
+    own, exchanged = [], []  # one contingency table per pair of groups
     for one, other in zip(members[0::2], members[1::2]):
         count = min(len(one), len(other))
         here = np.concatenate([one[:count], other[:count]])
@@ -92,27 +97,27 @@ def dependence(
         own.append(contingency(maps[here], descriptor[here], common, values))
         exchanged.append(contingency(maps[there], descriptor[here], common, values))
     coins = rng.integers(2, size=(draws + 1, len(own)))
-    coins[0] = 0  # nothing exchanged: the data as they are
-    as_tossed = _measured(np.array(own), np.array(exchanged), coins)
-    the_other_way = _measured(np.array(own), np.array(exchanged), 1 - coins)
-    bits, auc = (Measure(a[0], b[0], a[1:] - b[1:]) for a, b in zip(as_tossed, the_other_way))
+    coins[0] = 0  # the data themselves
+    observed = _measured(np.array(own), np.array(exchanged), coins)
+    swapped = _measured(np.array(own), np.array(exchanged), 1 - coins)
+    bits, auc = (Measure(a[0], b[0], a[1:] - b[1:]) for a, b in zip(observed, swapped))
     return bits, auc
 
 
 def _measured(own: np.ndarray, exchanged: np.ndarray, coins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bits and AUC for each row of `coins` (draws, pairs): 0 takes the table of `own` (pairs, values, 2), else 1."""
+    """Bits and AUC per row of `coins` (draws, pairs): 0 takes a table of `own` (pairs, values, 2), 1 of `exchanged`."""
     change = exchanged - own
     first, second = (
         own[half::2].sum(axis=0) + np.tensordot(coins[:, half::2], change[half::2], axes=1) for half in (0, 1)
     )
     auc = [(prediction_auc(a, b) + prediction_auc(b, a)) / 2 for a, b in zip(first, second)]
-    # the plug-in estimate is too large by chance, and half of the data by twice as much: extrapolated to none
+    # the bias of the plug-in estimate is twice as large for half of the data: extrapolated to no bias
     bits = 2 * mutual_information(first + second) - (mutual_information(first) + mutual_information(second)) / 2
     return bits, np.array(auc)
 
 
 def contingency(maps: np.ndarray, descriptor: np.ndarray, valid: np.ndarray, values: int) -> np.ndarray:
-    """(values, 2) int64: how many of the `valid` cells have each descriptor, black and white."""
+    """(values, 2) int64: number of `valid` cells per value of the descriptor, black and white."""
     index = 2 * descriptor[valid].astype(np.int64) + maps[valid]
     return np.bincount(index, minlength=2 * values).reshape(values, 2)
 
@@ -120,7 +125,7 @@ def contingency(maps: np.ndarray, descriptor: np.ndarray, valid: np.ndarray, val
 def mutual_information(table: np.ndarray) -> np.ndarray:
     """Plug-in mutual information of rows and columns of contingency tables (..., values, 2): (...) float64, bits.
 
-    It is at least 0, and larger than that by chance: hold it against a null distribution.
+    It is at least 0, and biased upwards: compare it with a null distribution.
     """
     joint = table / np.maximum(table.sum(axis=(-2, -1), keepdims=True), 1)
     independent = joint.sum(axis=-1, keepdims=True) * joint.sum(axis=-2, keepdims=True)
@@ -129,10 +134,10 @@ def mutual_information(table: np.ndarray) -> np.ndarray:
 
 
 def prediction_auc(fitted: np.ndarray, scored: np.ndarray) -> float:
-    """ROC-AUC, on the cells of one contingency table, of predicting white by its frequency in another.
+    """ROC-AUC on one contingency table of the frequency of white per value in another table.
 
-    Both are (values, 2). A value that was never seen is predicted as often as white is overall. NaN where all cells
-    are white, or none is.
+    fitted, scored: (values, 2). The score of a value without fitted cells is the overall frequency of white. NaN if all
+    scored cells are white, or none is.
     """
     overall = fitted[:, 1].sum() / max(fitted.sum(), 1)
     score = (fitted[:, 1] + overall) / (fitted.sum(axis=1) + 1)
@@ -145,15 +150,15 @@ def prediction_auc(fitted: np.ndarray, scored: np.ndarray) -> float:
 
 
 def class_of_cells(classes: torch.Tensor) -> np.ndarray:
-    """(B, M, M) int64: class of what is on each cell, K for none of them; classes: (B, K, M, M) float32 masks."""
+    """(B, M, M) int64: class of each cell, K for none; classes: (B, K, M, M) float32 masks."""
     found, label = classes.max(dim=1)
     return torch.where(found > 0, label, classes.shape[1]).numpy()
 
 
 def shape_of_cells(label: np.ndarray) -> np.ndarray:
-    """Class and distance from its edge: (B, M, M) int64, label * 4 + whole cells to the next other class (at most 3).
+    """Class and distance from its edge: (B, M, M) int64, label * 4 + whole cells to another class (at most 3).
 
-    label: (B, M, M) int, as of `class_of_cells`; the rim of the map is no edge.
+    label: (B, M, M) int, see `class_of_cells`; the border of the map is no edge
     """
     shapes = np.empty_like(label)
     for label_of_view, shape in zip(label, shapes):
@@ -162,21 +167,21 @@ def shape_of_cells(label: np.ndarray) -> np.ndarray:
             inside = label_of_view == value
             if not inside.all():
                 distance[inside] = ndimage.distance_transform_cdt(inside)[inside]
-        shape[:] = label_of_view * _DEEPEST + np.minimum(distance - 1, _DEEPEST - 1)
+        shape[:] = label_of_view * _DISTANCES + np.minimum(distance - 1, _DISTANCES - 1)
     return shapes
 
 
 def colour_of_cells(rgb: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> np.ndarray:
-    """The photograph's mean colour on each cell, in 64 steps: (B, M, M) int64, -1 for a cell that no pixel falls into.
+    """Mean RGB colour of the pixels per cell, in 64 steps: (B, M, M) int64, -1 for a cell without pixels.
 
-    rgb: (B, 3, H, W) in [0, 1]; depth: (B, 1, H, W), metres: pixels are put on the map as in P^-1.
+    rgb: (B, 3, H, W) in [0, 1]; depth: (B, 1, H, W), metres. P^-1 gives the cell of each pixel.
     """
     cells = camera.bev_px**2
     cell = cells_of_pixels(depth[:, 0], camera).flatten(1)
-    place = (cell + torch.arange(len(cell))[:, None] * (cells + 1)).flatten().numpy()
-    pixels = np.bincount(place, minlength=len(rgb) * (cells + 1))
+    index = (cell + torch.arange(len(cell))[:, None] * (cells + 1)).flatten().numpy()
+    pixels = np.bincount(index, minlength=len(rgb) * (cells + 1))
     step = np.zeros(len(pixels), np.int64)
     for channel in rgb.unbind(1):
-        mean = np.bincount(place, weights=channel.flatten().numpy(), minlength=len(pixels)) / np.maximum(pixels, 1)
+        mean = np.bincount(index, weights=channel.flatten().numpy(), minlength=len(pixels)) / np.maximum(pixels, 1)
         step = step * _SHADES + np.minimum((mean * _SHADES).astype(np.int64), _SHADES - 1)
     return np.where(pixels > 0, step, -1).reshape(len(rgb), -1)[:, :-1].reshape(len(rgb), camera.bev_px, camera.bev_px)

@@ -1,9 +1,8 @@
-"""Intersection over union, kept as counts per test scene, and intervals from resampling scenes.
+"""Intersection over union from counts per test scene, and bootstrap intervals over scenes.
 
-The two averages are the paper's (supplement, "Metrics"). Counts are exact integers, so that they merge in
-any order, survive JSON, and give any average or interval later without the predictions. torchmetrics'
-`JaccardIndex` keeps one confusion matrix for all images; one object a scene, with its state read back
-out, would be longer than these sums. The tests hold the two against each other.
+The two averages are the paper's (supplement, "Metrics"). Counts are exact integers: they add up in any order, survive
+JSON, and give any average or interval later without the predictions. `JaccardIndex` of torchmetrics has one confusion
+matrix for all images; one object per scene would take more code than these sums. The tests compare the two.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,33 +15,37 @@ from torch import Tensor
 
 from zerobev.common.errors import InputError
 
-#: From intersections and unions (..., K) to a value (...), or a value of each class (..., K).
+#: Quantiles that bound all 90 % intervals.
+INTERVAL = ((1 - 0.9) / 2, (1 + 0.9) / 2)
+#: Draws of a bootstrap.
+DRAWS = 1000
+#: From intersections and unions (..., K) to a value (...), or a value per class (..., K).
 Statistic = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def iou_per_class(intersection: np.ndarray, union: np.ndarray) -> np.ndarray:
-    """(..., K) counts -> (..., K) float64; a class that is neither present nor predicted is NaN."""
+    """(..., K) counts -> (..., K) float64; NaN for a class that is neither present nor predicted."""
     return np.divide(intersection, union, out=np.full(np.shape(union), np.nan), where=np.asarray(union) > 0)
 
 
 def class_iou(intersection: np.ndarray, union: np.ndarray) -> np.ndarray:
-    """(..., K) counts -> (...) mean of the classes' IoU; NaN classes are left out, NaN if all are."""
+    """(..., K) counts -> (...) mean IoU of the classes without NaN; NaN if all are NaN."""
     seen = (np.asarray(union) > 0).sum(axis=-1)
     total = np.nansum(iou_per_class(intersection, union), axis=-1)
     return np.divide(total, seen, out=np.full(np.shape(seen), np.nan), where=seen > 0)
 
 
 def pixel_iou(intersection: np.ndarray, union: np.ndarray) -> np.ndarray:
-    """(..., K) counts -> (...) sum of all intersections over sum of all unions; NaN if there are none."""
+    """(..., K) counts -> (...) sum of intersections over sum of unions; NaN if all unions are 0."""
     return iou_per_class(np.sum(intersection, axis=-1), np.sum(union, axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Cells of each test scene and class, summed over the scene's images."""
+    """Numbers of cells per test scene and class, summed over the images of the scene."""
 
     intersection: np.ndarray  #: (S, K) int64, cells in both the true and the predicted mask
-    union: np.ndarray  #: (S, K) int64, cells in either
+    union: np.ndarray  #: (S, K) int64, cells in at least one of them
 
     def __post_init__(self) -> None:
         intersection, union = self.intersection, self.union
@@ -55,11 +58,11 @@ class Counts:
 
     @classmethod
     def empty(cls, scenes: int, classes: int) -> "Counts":
-        """No image counted yet."""
+        """Counts of no image."""
         return cls(np.zeros((scenes, classes), np.int64), np.zeros((scenes, classes), np.int64))
 
     def __add__(self, other: "Counts") -> "Counts":
-        """The counts of both sets of images; the scenes must be the same ones."""
+        """Counts of both sets of images, of the same scenes."""
         if self.union.shape != other.union.shape:
             raise InputError(f"counts: expected the shape {self.union.shape}, found {other.union.shape}")
         return Counts(self.intersection + other.intersection, self.union + other.union)
@@ -76,15 +79,15 @@ class Counts:
         return statistic(self.intersection.sum(axis=0), self.union.sum(axis=0))
 
     def iou_per_class(self) -> np.ndarray:
-        """(K,) float64; NaN for a class that is neither present nor predicted in any scene."""
+        """(K,) float64, over all scenes; NaN for a class that is neither present nor predicted."""
         return self.value(iou_per_class)
 
     def class_iou(self) -> float:
-        """Average class IoU: all classes weigh the same; those that are NaN are left out."""
+        """Average class IoU: the mean over classes, without NaN."""
         return float(self.value(class_iou))
 
     def pixel_iou(self) -> float:
-        """Average pixel IoU: classes weigh by their area."""
+        """Average pixel IoU: classes are weighted by their area."""
         return float(self.value(pixel_iou))
 
     def to_json(self) -> dict[str, list[list[int]]]:
@@ -101,12 +104,13 @@ class Counts:
 
 
 def count(predicted: Tensor, target: Tensor, fov: Tensor, scene: Tensor, scenes: int) -> Counts:
-    """Intersections and unions inside the FOV of a batch of binary maps.
+    """Intersections and unions of a batch of binary maps, inside the field of view.
 
     predicted: (B, K, M, M) bool
     target: (B, K, M, M) in {0, 1}
     fov: (B, 1, M, M) in {0, 1}
     scene: (B,) integers in [0, scenes)
+    Raises `InputError` for maps of different shapes, and for scenes out of range.
     """
     if predicted.shape != target.shape:
         raise InputError(
@@ -125,34 +129,34 @@ def count(predicted: Tensor, target: Tensor, fov: Tensor, scene: Tensor, scenes:
 
 
 def bootstrap_interval(
-    counts: Sequence[Counts], statistic: Statistic, rng: np.random.Generator, level: float = 0.9, draws: int = 1000
+    counts: Sequence[Counts], statistic: Statistic, rng: np.random.Generator, draws: int = DRAWS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Percentile interval of the statistic's mean over seeds, from resampling test scenes and seeds with replacement.
+    """90 % percentile interval of the mean over seeds, by resampling test scenes and seeds with replacement.
 
-    counts: one a seed, of the same scenes; every draw takes the same scenes from all of them
-    statistic: `class_iou`, `pixel_iou` or `iou_per_class`, or another function of (..., K) counts
-    Returns the lower and upper end that enclose the share `level` of `draws` draws.
+    counts: one per seed, of the same scenes; a draw takes the same scenes for all seeds
+    statistic: `class_iou`, `pixel_iou`, `iou_per_class`, or another function of (..., K) counts
+    Returns the lower and the upper end.
     """
     (values,) = resampled_scenes([counts], statistic, rng, draws)
-    low, high = np.nanquantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    low, high = np.nanquantile(values, INTERVAL, axis=0)
     return low, high
 
 
 def resampled_scenes(
     rows: Sequence[Sequence[Counts]], statistic: Statistic, rng: np.random.Generator, draws: int
 ) -> list[np.ndarray]:
-    """The statistic's mean over seeds of several rows, (draws, ...) each, under resampling of test scenes and of seeds.
+    """The mean of the statistic over seeds per row, (draws, ...) each, with resampled test scenes and seeds.
 
-    rows: counts of each row, one a seed, all of the same scenes. They are paired: draw i takes the same scenes from
-    all rows and seeds, so that differences and quotients of rows have intervals of their own. Seeds are drawn for each
-    row by itself, as trainings are: what another training might have undone is then not certain. Of three seeds that
-    is a rough measure, and of one none at all.
+    rows: counts of each row, one per seed, all of the same scenes. Draw i takes the same scenes for all rows and seeds,
+        so that differences and quotients of rows have valid intervals. Seeds are drawn independently per row, as
+        trainings are independent; with three seeds the spread over trainings is a rough estimate, with one it is 0.
+    Raises `InputError` for rows of different scenes.
     """
     scenes = {len(one.union) for counts in rows for one in counts}
     if len(scenes) != 1 or 0 in scenes:
         raise InputError(f"counts: expected the same scenes in all, found {sorted(scenes)} scenes")
     (size,) = scenes
-    weights = rng.multinomial(size, np.full(size, 1 / size), size=draws)  # how often each scene is in each draw
+    weights = rng.multinomial(size, np.full(size, 1 / size), size=draws)  # times that each scene is drawn
     means = []
     for counts in rows:
         values = np.stack([statistic(weights @ one.intersection, weights @ one.union) for one in counts])

@@ -1,7 +1,7 @@
 """Flow on the map against true motion.
 
-In generated homes an object is moved between two photographs of a camera that stands still, so that the motion of each
-of its pixels on the map is known. Rows are projections: P^-1 with estimated depth (a.2), and the networks that ship.
+In a generated home, an object moves between two photographs of a fixed camera, so the motion of its pixels on the map
+is known. Rows are projections: P^-1 with estimated depth (a.2), and the shipped networks.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,7 +13,6 @@ import pandas as pd
 import torch
 from scipy.stats import bootstrap
 
-from zerobev.common.errors import InputError
 from zerobev.common.progress import progress
 from zerobev.config import AgentConfig, CameraConfig
 from zerobev.geometry.projection import map_points
@@ -28,39 +27,40 @@ from zerobev.scenes.moving import movable, moved
 from zerobev.scenes.readers import read_scene
 from zerobev.scenes.scene import Scene
 
-#: Side of the photographs: flow needs finer ones than the networks do.
+#: Side of the photographs; flow needs a higher resolution than the networks.
 PHOTOGRAPH_PX = 256
-_SHIFT_M = (0.2, 0.6)  # an object moves this far
-_SIZE = (0.01, 0.4)  # of an object, as a share of the photograph
+_SHIFT_M = (0.2, 0.6)  # range of an object's motion
+_AREA = (0.01, 0.4)  # range of an object's area, as a fraction of the photograph
 _SPACING_PX = 16  # of vectors
+_MIN_PX = 1.0  # length of a vector
 _TRIES = 100
 
 
 @dataclass(frozen=True, eq=False)
 class MovingPair:
-    """Two photographs between which one object moves. P pixels a side."""
+    """Two photographs between which one object moves, P x P pixels each."""
 
     first: np.ndarray  #: (P, P, 3) uint8
     second: np.ndarray  #: (P, P, 3) uint8
-    on_object: np.ndarray  #: (P, P) bool: pixels of `first` that see the object
-    point_m: np.ndarray  #: (P, P, 2) float64: map position, right and forward, of what each pixel of `first` sees
+    on_object: np.ndarray  #: (P, P) bool: pixels of `first` on the object
+    point_m: np.ndarray  #: (P, P, 2) float64: map position of each pixel of `first`, right and forward
     flow_px: np.ndarray  #: (P, P, 2) float64: true flow, right and down
     motion_m: np.ndarray  #: (2,) float64: true motion on the map, right and forward
 
 
-def moving_pair(scene: Scene, camera: CameraConfig, rng: np.random.Generator) -> MovingPair:
-    """A random object of a generated home, seen by a random camera, moved by a random shift along the floor.
+def moving_pair(scene: Scene, camera: CameraConfig, rng: np.random.Generator) -> MovingPair | None:
+    """A random object of a generated home, moved by a random shift along the floor in view of a random camera.
 
-    The object keeps what is seen of it from above, so that it did not move into a wall or off the map. Raises
-    `InputError` where no object of the home can be moved like that.
+    The object stays visible from above, so that it neither enters a wall nor leaves the map. None if no such motion is
+    found.
     """
     fine = replace(camera, fpv_px=PHOTOGRAPH_PX)
     ids, caster = movable(scene), RayCaster(scene)
     floor = navigable_floor(scene, AgentConfig(), rng)
     for _ in range(_TRIES if ids else 0):
         pose = floor.draw(rng)
-        share = {i: np.mean(caster.fpv(pose, camera).instance == i) for i in ids}
-        seen = [i for i in ids if _SIZE[0] < share[i] < _SIZE[1]]
+        area = {i: np.mean(caster.fpv(pose, camera).instance == i) for i in ids}
+        seen = [i for i in ids if _AREA[0] < area[i] < _AREA[1]]
         if not seen:
             continue
         chosen = int(rng.choice(seen))
@@ -70,7 +70,7 @@ def moving_pair(scene: Scene, camera: CameraConfig, rng: np.random.Generator) ->
         caster_after = RayCaster(after)
         cells = [np.sum(one.bev(pose, camera).instance == chosen) for one in (caster, caster_after)]
         visible = np.mean(caster_after.fpv(pose, camera).instance == chosen)
-        if cells[0] < 3 or cells[1] < 0.9 * cells[0] or visible < share[chosen] / 2:
+        if cells[0] < 3 or cells[1] < 0.9 * cells[0] or visible < area[chosen] / 2:
             continue
         seen_first = caster.fpv(pose, fine)
         points = map_points(torch.from_numpy(seen_first.distance).double(), fine).numpy()
@@ -78,11 +78,11 @@ def moving_pair(scene: Scene, camera: CameraConfig, rng: np.random.Generator) ->
         first, second = (Photographer(one, fine).take(pose) for one in (scene, after))
         flow = true_flow(points, motion, fine) * on_object[..., None]
         return MovingPair(first, second, on_object, points[..., :2], flow, motion[:2])
-    raise InputError(f"scene {scene.name}: expected an object that can be seen to move, found none in {_TRIES} views")
+    return None
 
 
 def true_flow(points: np.ndarray, motion: np.ndarray, camera: CameraConfig) -> np.ndarray:
-    """Points (H, W, 3) of the map frame that move by `motion` (3,), metres -> (H, W, 2) pixels right and down."""
+    """Points (H, W, 3) in the map frame that move by `motion` (3,), metres -> (H, W, 2) pixels right and down."""
     pixels = []
     for x, y, z in (np.moveaxis(points, -1, 0), np.moveaxis(points + motion, -1, 0)):
         depth = np.where(y > 0, y, np.nan)
@@ -91,16 +91,17 @@ def true_flow(points: np.ndarray, motion: np.ndarray, camera: CameraConfig) -> n
 
 
 def arrow_errors(projector: Projector, pair: MovingPair, field: np.ndarray) -> pd.DataFrame | None:
-    """Errors of the arrows of a flow field that start on the object; None where no vector does.
+    """Errors of the arrows of a flow field that start on the object; None if no vector on it is a pixel long.
 
-    One line a vector, metres: `start` and `end`, distances to their true places, and `motion`, that between the arrow
-    and the true one. An arrow without a place on the map has NaN.
+    field: (P, P, 2) floating point, pixels right and down
+    Returns one line per vector, metres: distances of `start` and `end` to their true positions, and of `motion` to the
+    true motion. An arrow without a position on the map has NaN.
     """
     on_object = np.where(pair.on_object[..., None], field, 0).astype(np.float64)
-    try:
-        flow = Flow.of(on_object, pair.second, spacing_px=_SPACING_PX)
-    except InputError:  # the object's flow is all below a pixel
+    grid = slice(_SPACING_PX // 2, None, _SPACING_PX)  # of `Flow.of`
+    if np.linalg.norm(on_object[grid, grid], axis=-1).max() < _MIN_PX:
         return None
+    flow = Flow.of(on_object, pair.second, _MIN_PX, _SPACING_PX)
     arrows = projector.project(pair.first, flow)
     assert isinstance(arrows, BevArrows)  # as of every flow
     column, row = np.floor(flow.start_px).astype(int).T
@@ -111,9 +112,9 @@ def arrow_errors(projector: Projector, pair: MovingPair, field: np.ndarray) -> p
 
 
 def evaluate_motion(pairs: Iterable[MovingPair]) -> pd.DataFrame:
-    """Mean errors of each pair: columns pair, flow ("true" or "tvl1"), row, vectors, missing, start, end, motion.
+    """Mean errors per pair: columns pair, flow ("true" or "tvl1"), row, vectors, missing, start, end, motion.
 
-    The row "still" is an arrow of length zero at the true place: its error is how far the object moved.
+    The row "still" is an arrow of length zero at the true position; its error is the length of the motion.
     """
     projectors = {row: load(row) for row in (GEOMETRIC, *ROWS)}
     lines = []
@@ -132,7 +133,7 @@ def evaluate_motion(pairs: Iterable[MovingPair]) -> pd.DataFrame:
 
 
 def motion_table(errors: pd.DataFrame) -> pd.DataFrame:
-    """Means over pairs, in metres, with 90 % intervals from resampling pairs; one line a flow and row."""
+    """Means over pairs, in metres, with 90 % bootstrap intervals over pairs; one line per flow and row."""
     lines = []
     for (flow, row), group in errors.groupby(["flow", "row"], sort=False):
         cells = []
@@ -151,16 +152,13 @@ def motion_table(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def moving_pairs(folders: list[Path], count: int, seed: int) -> Iterator[MovingPair]:
-    """`count` pairs, a home after the other; homes without an object that can be moved are passed over."""
+    """`count` pairs, one per home; homes without a visible motion are skipped."""
     found = 0
     rng, camera = np.random.default_rng(seed), load(GEOMETRIC).camera
     for folder in progress(folders, "homes", "home", len(folders)):
         if found == count:
             return
-        scene = read_scene(folder)
-        try:
-            pair = moving_pair(scene, camera, rng)
-        except InputError:  # nothing in it can be moved
-            continue
-        yield pair
-        found += 1
+        pair = moving_pair(read_scene(folder), camera, rng)
+        if pair is not None:
+            yield pair
+            found += 1

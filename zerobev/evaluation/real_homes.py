@@ -1,8 +1,8 @@
 """Evaluate the shipped weights on a folder of homes.
 
-Reads homes in HM3DSem layout; prints a table and writes it with `--json`. The networks were trained on generated homes
-alone, so every annotated scene of the folder is a test scene. Views are rendered on the spot. Rows as in Table 1: P^-1
-with true depth (a.1) and with estimated depth (a.2), and the networks that ship.
+Reads homes in HM3DSem layout; prints a table and writes the counts with `--json`. The networks were trained only on
+generated homes, so all annotated scenes of the folder are test scenes. Views are rendered, not stored. Rows as in
+Table 1: P^-1 with true depth (a.1) and with estimated depth (a.2), and the shipped networks.
 """
 
 import argparse
@@ -36,7 +36,7 @@ METHODS = {ORACLE: "P^-1 with true depth", GEOMETRIC: "P^-1 with estimated depth
 
 
 def render_views(folder: Path, number: int, views: int, camera: CameraConfig, seed: int) -> dict[str, Tensor]:
-    """`views` fresh views of a scene as one batch, with the eight classes as modalities; `scene` is `number`."""
+    """`views` random views of a scene as one batch, with the eight classes as modalities; `scene` is `number`."""
     scene = read_scene(folder)
     rng = np.random.default_rng([seed, zlib.crc32(folder.name.encode())])
     source = ViewSource(scene, camera, TextureConfig(), rng)
@@ -47,10 +47,10 @@ def render_views(folder: Path, number: int, views: int, camera: CameraConfig, se
 
 
 def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict[str, Counts], dict[str, str]]:
-    """Intersections and unions of every row of `METHODS` on `views` views of each scene.
+    """Intersections and unions per row of `METHODS`, on `views` views per scene.
 
-    Returns the counts, and the failures of scenes, for whatever reason, name -> message: these scenes count nothing.
-    Raises `InputError` where every scene fails.
+    Returns the counts without the scenes that failed, and the messages of these, by name.
+    Raises `InputError` if all scenes fail.
     """
     if views < 1:
         raise InputError(f"views: expected 1 or more, found {views}")
@@ -79,7 +79,7 @@ def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict
 
 
 def results_table(counts: dict[str, Counts]) -> pd.DataFrame:
-    """IoU in percent, one line a row; averages with their 90 % intervals over scenes."""
+    """IoU in percent, one line per row; averages with 90 % intervals over scenes."""
     lines = []
     for row, one in counts.items():
         averages = []

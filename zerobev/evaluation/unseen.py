@@ -1,8 +1,7 @@
-"""Modalities that no network was trained on, against their truth from the G-buffer (paper, Section 4).
+"""Modalities on which no network was trained, against their true maps from the G-buffer (paper, Section 4).
 
-Semantic classes are what the paper's tables measure. Anything else that is known of surfaces can be projected, too, and
-its true map is known wherever both sensors know the surface: objects one by one, their outlines, labels without any
-meaning, and what a robot could do where.
+The paper's tables measure semantic classes. Any other property of surfaces can be projected too, and the G-buffer of
+the map gives its true map: single objects, their outlines, labels without meaning, and uses of surfaces for a robot.
 """
 
 from collections.abc import Iterable, Mapping
@@ -24,17 +23,16 @@ from zerobev.inference.projector import GEOMETRIC, load
 from zerobev.inference.shipped_weights import ROWS
 from zerobev.scenes.readers import read_scene
 
-#: name -> what is white
-MODALITIES = {
-    "instances": "objects of the six classes that stand in rooms, a mask each",
-    "outlines": "edges of objects, where a neighbouring pixel or cell belongs to another one",
-    "random labels": "blocks of surface, half a metre wide, with one of four labels that mean nothing",
-    "to sit on": "chairs, sofas, beds and toilets together",
-    "to put things on": "surfaces 0.4 to 1.1 m above the floor that are no wall",
-}
-VIEWS = 10  # of each home
-_LEAST_PX = 20  # an instance with fewer pixels is no mask
-_BLOCK = 50  # texels of a random label, 1 cm each
+MODALITIES = (
+    "instances",  # objects of the six classes without wall and floor, one mask each
+    "outlines",  # edges of objects, next to a pixel or cell of another object
+    "random labels",  # surface blocks of half a metre with one of four random labels, one mask per label
+    "to sit on",  # chairs, sofas, beds and toilets in one mask
+    "to put things on",  # surfaces of objects 0.4 to 1.1 m above the floor
+)
+VIEWS = 10  # per home
+_MIN_PX = 20  # of an instance's mask
+_BLOCK = 50  # side of a block with one random label, texels of 1 cm
 _LABELS = 4
 _SURFACE_M = (0.4, 1.1)
 _STRUCTURE = ("wall", "floor")
@@ -44,12 +42,12 @@ _SEATS = ("chair", "sofa", "bed", "toilet")
 def unseen_masks(
     view: View, instance_label: np.ndarray, camera: CameraConfig, rng: np.random.Generator
 ) -> dict[str, Pair]:
-    """Every modality of a view: (K, H, H) and (K, M, M) bool, K of its own; `rng` draws the random labels."""
+    """Masks of each modality of a view: (K, H, H) and (K, M, M) bool, K per modality; `rng` draws the random labels."""
     labels = instance_label[view.fpv_instance], instance_label[view.bev_instance]
     ids, pixels = np.unique(view.fpv_instance, return_counts=True)
     structure = [LABELS.index(name) for name in _STRUCTURE]
-    standing = (pixels >= _LEAST_PX) & ~np.isin(instance_label[ids], [NO_LABEL, *structure])
-    table = rng.integers(_LABELS, size=(61, 61, 61))  # repeats after 61 blocks
+    standing = (pixels >= _MIN_PX) & ~np.isin(instance_label[ids], [NO_LABEL, *structure])
+    table = rng.integers(_LABELS, size=(61, 61, 61))  # is repeated every 61 blocks
     heights = map_points(torch.from_numpy(view.depth), camera)[..., 2].numpy(), view.bev_height
     nothing = view.fpv_texel[..., 0] < 0, view.bev_texel[..., 0] < 0
     images = []
@@ -71,9 +69,9 @@ def unseen_masks(
 
 
 def evaluate_unseen(folders: Iterable[Path], views: int = VIEWS) -> dict[str, Counts]:
-    """Intersections and unions of the projection (a.2) and the shipped networks, a column a modality.
+    """Intersections and unions of the projection (a.2) and the shipped networks, one column per modality.
 
-    folders: of scenes in HM3DSem layout, each of which is rendered at `views` fresh poses
+    folders: scenes in HM3DSem layout, rendered at `views` random poses each
     Raises `InputError` for a scene that cannot be read.
     """
     folders = list(folders)
@@ -97,12 +95,12 @@ def evaluate_unseen(folders: Iterable[Path], views: int = VIEWS) -> dict[str, Co
 
 
 def _summed(cells: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Counts (S, K) of masks -> (S, modalities): of each, its own masks together, which may be none."""
+    """Counts (S, K) of masks -> (S, modalities): sums over the masks of each modality, which may have none."""
     return np.stack([mine.sum(axis=1) for mine in np.split(cells, ends, axis=1)], axis=1)
 
 
 def unseen_table(counts: Mapping[str, Counts]) -> pd.DataFrame:
-    """IoU in percent with its 90 % interval over homes: a line a modality, a column a row."""
+    """IoU in percent with 90 % intervals over homes: one line per modality, one column per row."""
     cells = {}
     for row, one in counts.items():
         low, high = bootstrap_interval([one], iou_per_class, np.random.default_rng(0))

@@ -1,7 +1,7 @@
 """The depth estimator of a scale: trained once, recorded, and used by every learned method.
 
-Its depth is that of the projection (a.2) and of the residual models; the weights of its RGB backbone are the first
-weights of every learned method's backbone, in place of ImageNet's.
+The projection (a.2) and the residual models read its depth. Every learned method starts from the weights of its RGB
+backbone, in place of ImageNet's.
 """
 
 import shutil
@@ -26,7 +26,7 @@ from zerobev.models.depth import DepthNet
 from zerobev.training.depth import depth_errors, predict_depth, train_depth
 from zerobev.training.distributed import rank_and_world_size
 
-#: The fields of `ModelConfig` that the network is made of.
+#: The fields of `ModelConfig` that the network depends on.
 _FIELDS = ("width", "block", "depths", "channels", "stem_channels", "stem_stride")
 
 _SEED = 0  # one estimator serves all seeds of all runs
@@ -35,8 +35,8 @@ _SEED = 0  # one estimator serves all seeds of all runs
 class DepthPretraining:
     """The depth estimator of a workspace: read if it is recorded, else trained and recorded.
 
-    Its record `reports/<scale>/depth.json` and its weights beside it are committed, so that nobody has to train it
-    again. With settings that change the estimator, both lie in the cache, and the committed ones stay.
+    Its record `reports/<scale>/depth.json` and the weights beside it are committed. With settings that change the
+    estimator, both go to the cache, and the committed files stay as they are.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -60,24 +60,23 @@ class DepthPretraining:
         return self._folder / "depth.json"
 
     @property
-    def is_recorded(self) -> bool:
-        """Whether it need not be trained."""
-        return self._weights.exists() and find(self.path, Record, self.key, self.config) is not None
-
-    @property
     def _weights(self) -> Path:
         return self._folder / "depth.safetensors"
 
     @property
     def weights(self) -> Path:
-        """The file of its weights, trained now if it is missing."""
+        """The file of its weights; the network is trained now if the file is missing."""
         _ = self.record
         return self._weights
 
+    def recorded(self) -> Record | None:
+        """Its record; None if the record or the weights are missing."""
+        return find(self.path, Record, self.key, self.config) if self._weights.exists() else None
+
     @cached_property
     def record(self) -> Record:
-        """Its record; the result: errors `mad_m` and `relative` on the test views, and the training curves."""
-        record = find(self.path, Record, self.key, self.config) if self._weights.exists() else None
+        """Its record. Result: errors `mad_m` and `relative` on the test views, and the training curves."""
+        record = self.recorded()
         if record is None:
             record = self._compute()
             if rank_and_world_size()[0] == 0:
@@ -90,7 +89,7 @@ class DepthPretraining:
         return DepthNet.load(self.weights)
 
     def views(self, split: Split) -> ViewSet:
-        """The views of a split with estimated depth in place of the true one; it is estimated once and cached."""
+        """The views of a split, with estimated depth in place of true depth; estimates are cached."""
         views = self._workspace.views(split)
         folder = self._workspace.cache / self.key / split
         paths = [folder / f"{shard.path.stem}.npy" for shard in views.shards]
@@ -120,7 +119,7 @@ class DepthPretraining:
         errors = depth_errors(network, workspace.views("test"), device)
         if rank_and_world_size()[0] == 0:
             network.cpu().save(self._weights)
-        shutil.rmtree(workspace.cache / self.key, ignore_errors=True)  # depth estimated by earlier weights
+        shutil.rmtree(workspace.cache / self.key, ignore_errors=True)  # estimates of earlier weights
         (workspace.runs / self.key / "checkpoint.pt").unlink(missing_ok=True)
         cost = {
             "train_seconds": round(history.seconds, 1),

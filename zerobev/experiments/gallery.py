@@ -1,4 +1,4 @@
-"""The test views whose predictions every record keeps, so that figures need no checkpoint."""
+"""The gallery: test views for which each run stores its predicted maps, so that figures need no checkpoint."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ GALLERY_VIEWS = 8
 
 
 def gallery(workspace: Workspace) -> dict[str, np.ndarray]:
-    """Inputs and truth of the gallery's views.
+    """Inputs and true maps of the gallery's views.
 
     rgb (N, H, H, 3) uint8; fpv_label (N, H, H) and bev_label (N, M, M) int8; fov (N, M, M) bool.
     """

@@ -1,8 +1,8 @@
 """Compute one row of a table, or read it if it is recorded.
 
-Reads homes, views and textures (made first if they are missing, in `.cache`); writes the record to
-`reports/<scale>/records/` and its maps to `reports/<scale>/gallery/`. On several GPUs it is started by `accelerate
-launch`: the processes share training and evaluation, the first one writes.
+Reads scenes, views and textures (made first if they are missing, in `.cache`); writes the record to
+`reports/<scale>/records/` and its maps to `reports/<scale>/gallery/`. For several GPUs, start it with `accelerate
+launch`: the processes share training and evaluation, and rank 0 writes.
 """
 
 import argparse
@@ -12,18 +12,17 @@ from accelerate import PartialState
 from filelock import FileLock
 
 from zerobev.common.parallel import cluster
-from zerobev.config import SCALES, SPLITS, Split
+from zerobev.config import SPLITS, Split
 from zerobev.experiments.registry import EXPERIMENTS, experiment
 from zerobev.experiments.runs import Run
-from zerobev.experiments.workspace import Workspace
+from zerobev.experiments.workspace import Workspace, add_workspace_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev run`."""
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
+    add_workspace_arguments(parser)
     parser.add_argument("--row", required=True, help=f"one of {', '.join(EXPERIMENTS)}")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
     parser.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="values, such as train.steps=2400"
     )
@@ -31,16 +30,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compute the record if it is missing, alone or beside other processes of a launch, and print its IoU."""
+    """Compute the record if it is missing, alone or with the other processes of a launch, and print its IoU."""
     workspace = Workspace(options.scale, options.scenes, settings=options.set)
     wanted = Run(experiment(options.row), workspace, options.seed)
     with _one_at_a_time(workspace), cluster(options.dask):
         _make_data(wanted)
-    # processes are joined only now: before, they would take each other's waiting for a failure
+    # after the data are made: a rank that waits for the lock could exceed the time limit of torch.distributed
     state = PartialState(cpu=not torch.cuda.is_available())
     estimated = _estimated(wanted)
     if estimated or (wanted.experiment.network and not wanted.backbone):
-        _ = wanted.pretraining.record  # trained by all, if it is missing
+        _ = wanted.pretraining.record  # trained by all ranks if it is missing
         state.wait_for_everyone()
         with _one_at_a_time(workspace):
             for split in estimated:
@@ -53,7 +52,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _make_data(wanted: Run) -> None:
-    """The views, and the textures, of a run."""
+    """Make the views and the textures of a run."""
     for split in SPLITS:
         wanted.workspace.views(split)
     if wanted.experiment.network and wanted.experiment.stream == "synth":
@@ -61,7 +60,7 @@ def _make_data(wanted: Run) -> None:
 
 
 def _estimated(wanted: Run) -> list[Split]:
-    """The splits whose depth is estimated for a run."""
+    """Splits that a run reads with estimated depth."""
     if not wanted.experiment.reads_depth:
         return []
     stages = wanted.experiment.stages
@@ -70,6 +69,6 @@ def _estimated(wanted: Run) -> list[Split]:
 
 
 def _one_at_a_time(workspace: Workspace) -> FileLock:
-    """A lock over all processes that see the cache: the first one makes the data that the others then find."""
+    """A lock shared by all processes that use the cache: the first makes the data, the others find it."""
     workspace.cache.mkdir(parents=True, exist_ok=True)
     return FileLock(workspace.cache / "data.lock")

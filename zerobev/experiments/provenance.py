@@ -1,10 +1,11 @@
-"""Where and with what a result is made: revision, versions, device, memory."""
+"""Origin of a result: revision, versions, device, memory."""
 
 import os
 import platform
 import re
 import resource
 import subprocess
+import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,9 @@ _PACKAGES = ("torch", "numpy", "transformers", "accelerate", "embreex", "pyrende
 
 
 def git_revision(code: Path = Path(__file__).parents[1]) -> str:
-    """The commit that `code` is checked out at, with "-dirty" if it differs; "unknown" if git does not track `code`.
+    """The commit of the checkout, with "-dirty" if files below `code` differ; "unknown" if git does not track `code`.
 
-    Only changes below `code` count: a reproduction writes reports and notebooks.
+    Other changes do not count: a reproduction writes reports and notebooks.
     """
     commands = ["describe", "--always", "--abbrev=12"], ["status", "--porcelain", "."], ["ls-files", "."]
     try:
@@ -23,7 +24,7 @@ def git_revision(code: Path = Path(__file__).parents[1]) -> str:
     except FileNotFoundError:  # no git
         return "unknown"
     revision, changes, tracked = (ended.stdout.strip() for ended in found)
-    if not tracked:  # no repository, or an environment inside that of another project
+    if not tracked:  # no repository, or an environment inside another project's repository
         return "unknown"
     return revision + "-dirty" if changes else revision
 
@@ -50,6 +51,7 @@ def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
     status = Path("/proc/self/status")
     found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
-    if found:  # Linux; `getrusage` would count the parent process, too
+    if found:  # Linux, where `getrusage` includes the parent process's peak
         return round(int(found[1]) / 1024, 1)
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS, else KiB
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)

@@ -1,4 +1,4 @@
-"""Recorded results that belong to the shipped weights: motion and unseen modalities."""
+"""Recorded results of the shipped weights: motion and unseen modalities. The networks run on the CPU."""
 
 from typing import Any
 
@@ -12,21 +12,23 @@ from zerobev.experiments.workspace import Workspace
 from zerobev.inference.shipped_weights import shipped_runs
 from zerobev.scenes.homes import ensure_homes
 
+PAIRS = 32  #: of photographs, for motion
 
-def recorded_motion(workspace: Workspace, count: int = 32) -> pd.DataFrame:
-    """Errors of `count` pairs of a workspace's generated test homes; its record is `motion.json` of the report."""
+
+def recorded_motion(workspace: Workspace) -> pd.DataFrame:
+    """`evaluate_motion` of `PAIRS` pairs in the generated test homes; recorded in `motion.json` of the report."""
     homes = list(workspace.split.test)
 
     def compute() -> dict[str, Any]:
         ensure_homes(homes, workspace.scale.scenes.seed, 1)
-        return evaluate_motion(moving_pairs(homes, count, seed=0)).to_dict(orient="list")
+        return evaluate_motion(moving_pairs(homes, PAIRS, seed=0)).to_dict(orient="list")
 
-    config = {"weights": shipped_runs(), "pairs": count, "scenes": workspace.scale.scenes}
-    return pd.DataFrame(recorded(workspace.reports / "motion.json", "motion", config, compute))
+    config = {"weights": shipped_runs(), "pairs": PAIRS, "scenes": workspace.scale.scenes}
+    return pd.DataFrame(recorded(workspace.reports / "motion.json", "motion", config, compute, device="cpu"))
 
 
 def recorded_unseen(workspace: Workspace) -> dict[str, Counts]:
-    """`evaluate_unseen` of a workspace's generated test homes; its record is `unseen.json` of the report."""
+    """`evaluate_unseen` in the generated test homes; recorded in `unseen.json` of the report."""
     homes = list(workspace.split.test)
 
     def compute() -> dict[str, Any]:
@@ -34,5 +36,5 @@ def recorded_unseen(workspace: Workspace) -> dict[str, Counts]:
         return {row: counts.to_json() for row, counts in evaluate_unseen(homes).items()}
 
     config = {"weights": shipped_runs(), "views": VIEWS, "scenes": workspace.scale.scenes}
-    found = recorded(workspace.reports / "unseen.json", "unseen", config, compute)
+    found = recorded(workspace.reports / "unseen.json", "unseen", config, compute, device="cpu")
     return {row: Counts.from_json(counts) for row, counts in found.items()}

@@ -1,7 +1,7 @@
 """Records: one committed JSON file per result, with its configuration, origin and cost.
 
-A number in a table comes from a record; a record comes from a command. All recorded results (runs, the depth
-estimator, benchmark, motion, unseen modalities) are of this form and are read and written here.
+A number in a table comes from a record; a record comes from a command. All recorded results have this form: runs, the
+depth estimator, benchmark, motion, unseen modalities.
 """
 
 import hashlib
@@ -18,24 +18,24 @@ from zerobev.common.keys import fingerprint, matches, plain
 from zerobev.common.storage import write_json
 from zerobev.experiments.provenance import git_revision, origin
 
-#: Raised by the reading of JSON that is no record.
+#: Errors of reading a file that is no record.
 NO_RECORD = (OSError, ValueError, KeyError, TypeError, RecursionError)
 
 
 @dataclass(frozen=True)
 class Record:
-    """A result, the configuration that it depends on, and where it comes from; all of it plain data."""
+    """A result with its configuration, origin and cost, as plain data."""
 
     key: str  #: name and fingerprint of the configuration
     config: dict[str, Any]  #: everything that the result depends on
     origin: dict[str, Any]  #: git revision, versions, device
-    cost: dict[str, float]  #: seconds; of trainings also the process's peak memory so far, MB
+    cost: dict[str, float]  #: seconds; for trainings also the peak memory of the process so far, MB
     result: dict[str, Any]
 
     @property
     def sha256(self) -> str:
-        """Of the whole record; stored with the maps of a run, so that a number changed later is found."""
-        # `default`: values that are not JSON fail when the file is written, after the maps
+        """SHA-256 of the whole record; stored with the maps of a run, so that later changes are detected."""
+        # `default`: a value that is not JSON raises when the file is written, after the maps
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True, default=str).encode()).hexdigest()
 
     @classmethod
@@ -64,13 +64,14 @@ def key_of(name: str, config: Mapping[str, Any]) -> str:
 def find(path: Path, kind: type[R], key: str, config: Mapping[str, Any] | None = None) -> R | None:
     """The record in `path`; None if it has to be made.
 
-    It has to be made if it is missing, is older than a call for fresh results, has another key, or was made with
-    another value of a field that has its default today.
+    It has to be made if it is missing, has another key, or stores another value for a field that has its default today.
+    With `make reproduce FRESH=1` it also has to be made if it is older than that call.
 
-    config: of today; without it, only the key is compared
+    config: today's configuration; None: only the key is compared
     Raises `InputError` for a file that is no such record.
     """
-    if not path.exists() or not is_fresh(path):
+    fresh_since = float(os.environ.get("ZEROBEV_FRESH", 0))
+    if not path.exists() or path.stat().st_mtime < fresh_since:
         return None
     try:
         record = kind.from_json(json.loads(path.read_text()))
@@ -83,17 +84,19 @@ def find(path: Path, kind: type[R], key: str, config: Mapping[str, Any] | None =
 
 
 def write(path: Path, record: Record) -> None:
-    """Write a record, whole or not at all."""
+    """Write a record; an interrupted write leaves no file."""
     write_json(path, asdict(record))
 
 
-def recorded(path: Path, name: str, config: Mapping[str, Any], compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The result of `compute`, read from the record in `path`, or computed now (on the CPU) and recorded.
+def recorded(
+    path: Path, name: str, config: Mapping[str, Any], compute: Callable[[], dict[str, Any]], device: str
+) -> dict[str, Any]:
+    """The result of `compute`: read from the record in `path`, or computed now and recorded.
 
-    Computed or read, the result is what JSON gives back, keys in the order of the file: tables made of it look the
-    same both times.
+    A computed result is read back from its file, so that its types and the order of its keys are the same both times.
 
     config: everything that the result depends on; a record of another configuration is replaced
+    device: type of the device that `compute` uses, such as "cpu"; stored in the record
     Raises `InputError` for a file that is no record.
     """
     key = key_of(name, config)
@@ -101,11 +104,6 @@ def recorded(path: Path, name: str, config: Mapping[str, Any], compute: Callable
         revision, started = git_revision(), time.monotonic()
         result = compute()
         cost = {"seconds": round(time.monotonic() - started, 1)}
-        write(path, Record(key, plain(config), origin("cpu", revision), cost, result))
+        write(path, Record(key, plain(config), origin(device, revision), cost, result))
         record = Record.from_json(json.loads(path.read_text()))
     return record.result
-
-
-def is_fresh(path: Path) -> bool:
-    """Whether a file is younger than the call for fresh results, `make reproduce FRESH=1`, if there was one."""
-    return path.stat().st_mtime >= float(os.environ.get("ZEROBEV_FRESH", 0))

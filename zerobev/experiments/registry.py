@@ -1,4 +1,4 @@
-"""The runs of the tables, as data; a row that stands in several tables is one run."""
+"""The runs of the tables, as data; a row of several tables is one run."""
 
 from dataclasses import dataclass, replace
 
@@ -8,21 +8,21 @@ from zerobev.models.variants import VARIANTS
 
 @dataclass(frozen=True)
 class Experiment:
-    """One row of a table: a network trained on a stream, or the projection P^-1, which is not trained.
+    """One row of a table: a network trained on a stream, or P^-1, which is not trained.
 
     Raises `InputError` for an unknown network, stream or depth.
     """
 
     row: str
     network: str | None = "c"  #: a row of `models.variants.VARIANTS`; None for P^-1
-    stream: Stream = "synth"  #: zero-shot stream of training
-    white_fraction: float = 0.20  #: of the texels of *Synth* textures
-    scales: tuple[float, float] | None = None  #: see `TextureConfig.scales`; None: those of the scale
-    fresh: bool = True  #: a new texture per sample; else one per scene, as in the paper
-    extruded: float | None = None  #: see `Scale.extruded_fraction`; None: that of the scale
-    paper_start: bool = False  #: as in the paper: no empty samples, no extruded textures, plain first weights
-    train_depth: tuple[Depth, ...] = ("true",)  #: of the stages of training, one after the other
-    test_depth: Depth = "estimated"  #: depth of P^-1 and of the residual model in the test
+    stream: Stream = "synth"  #: zero-shot stream in training
+    white_fraction: float = 0.20  #: fraction of white texels of *Synth* textures
+    scales: tuple[float, float] | None = None  #: see `TextureConfig.scales`; None: the scale's
+    fresh: bool = True  #: a new texture per sample; False: one per scene, as in the paper
+    extruded: float | None = None  #: see `Scale.extruded_fraction`; None: the scale's
+    paper_start: bool = False  #: as in the paper: no empty samples, no extruded textures, plain initial weights
+    train_depth: tuple[Depth, ...] = ("true",)  #: depth of each stage of training
+    test_depth: Depth = "estimated"  #: depth of P^-1 and of residual models in the test
 
     def __post_init__(self) -> None:
         if self.network is not None:
@@ -34,20 +34,20 @@ class Experiment:
 
     @property
     def reads_depth(self) -> bool:
-        """Whether depth is among its inputs; if not, `train_depth` and `test_depth` have no effect."""
+        """Whether depth is an input; if not, `train_depth` and `test_depth` have no effect."""
         return self.network is None or VARIANTS[self.network][1].get("residual", False)
 
     @property
     def stages(self) -> tuple[Depth, ...]:
-        """Depth of each stage of training."""
+        """Depth of each stage of training; one stage if depth is no input."""
         return self.train_depth if self.reads_depth else ("true",)
 
     def texture(self, scale: Scale) -> TextureConfig:
-        """The textures of its training."""
+        """Textures in training."""
         return replace(scale.texture, white_fraction=self.white_fraction, scales=self.scales or scale.texture.scales)
 
     def model(self, scale: Scale) -> ModelConfig:
-        """The network's configuration, before the changes of its variant."""
+        """Configuration of the network, before the changes of its variant."""
         if not self.paper_start:
             return scale.model
         return replace(
@@ -55,13 +55,13 @@ class Experiment:
         )
 
     def extruded_fraction(self, scale: Scale) -> float:
-        """The fraction of samples with extruded textures."""
+        """Fraction of training samples with extruded textures."""
         if self.extruded is not None:
             return self.extruded
         return 0.0 if self.paper_start else scale.extruded_fraction
 
     def empty_fraction(self, scale: Scale) -> float:
-        """The fraction of empty samples; none with the masks of the classes, many of which are empty."""
+        """Fraction of empty training samples; 0 for class masks, many of which are empty."""
         return 0.0 if self.paper_start or self.stream == "classes" else scale.empty_fraction
 
 
@@ -95,7 +95,7 @@ def _experiments() -> dict[str, Experiment]:
         # Table 5
         Experiment("c.modsem", stream="modsem"),
         Experiment("c.depthproj", stream="depthproj"),
-        # not in the paper: size of structures, extrusion, freshness, and the paper's choice in all of them
+        # not in the paper: size of structures, extrusion, fresh textures; then the paper's choice of all three
         Experiment("c.fixed", scales=(1.0, 1.0)),
         Experiment("c.mesh", extruded=0.0),
         Experiment("c.once", fresh=False),
@@ -109,5 +109,5 @@ EXPERIMENTS = _experiments()
 
 
 def experiment(row: str) -> Experiment:
-    """The run of a row; an unknown row is an `InputError` that lists the known ones."""
+    """The run of a row. Raises `InputError` for an unknown row."""
     return EXPERIMENTS[one_of("row", row, EXPERIMENTS)]

@@ -1,4 +1,4 @@
-"""Records of runs: counts of intersections and unions per test scene, and the maps predicted for the gallery."""
+"""Records of runs: intersections and unions per test scene, and the maps predicted for the gallery."""
 
 from functools import cached_property
 from pathlib import Path
@@ -13,11 +13,11 @@ from zerobev.experiments.records import Record, find, write
 
 
 class RunRecord(Record):
-    """One run: a row of a table with one seed."""
+    """The record of one run: a row of a table with one seed."""
 
     @property
     def row(self) -> str:
-        """Its row in the tables."""
+        """Row of the tables."""
         return self.config["experiment"]["row"]
 
     @property
@@ -37,11 +37,11 @@ class RunRecord(Record):
 
     @property
     def history(self) -> dict[str, list[float | None]]:
-        """Training curves by name; empty for a method without training."""
+        """Training curves by name; empty if nothing is trained."""
         return self.result["history"]
 
     def check(self) -> None:
-        """Raise `InputError`, `KeyError` or `TypeError` if this is no record of a run."""
+        """Raise `InputError`, `KeyError` or `TypeError` if the result is none of a run."""
         if type(self.row) is not str or type(self.seed) is not int or type(self.history) is not dict:
             raise InputError("expected a row, a seed and a history, found other types")
         names = [name for name in self.scenes if isinstance(name, str)]
@@ -65,11 +65,11 @@ class RunStore:
         return find(self.path(key), RunRecord, key, config)
 
     def write(self, record: RunRecord, maps: np.ndarray) -> None:
-        """Write a record, and its maps of the gallery's views, (views, classes, M, M) bool."""
+        """Write a record and its maps of the gallery's views, (views, classes, M, M) bool."""
         with replacing(self._maps_path(record.key)) as temporary:
             packed = np.packbits(maps, axis=-1)
             np.savez_compressed(temporary, maps=packed, cells=maps.shape[-1], record=record.sha256)
-        # the record last: if it exists, the run is complete
+        # the record comes last: if it exists, the run is complete
         write(self.path(record.key), record)
 
     def maps(self, key: str) -> np.ndarray:
@@ -85,7 +85,7 @@ class RunStore:
             raise InputError(f"{path}: expected the maps of a run, found {error!r}") from None
 
     def is_sealed(self, key: str) -> bool:
-        """Whether a record is, to the last digit, the one that its maps were written with."""
+        """Whether a record is unchanged since it was written: the file of its maps holds its SHA-256."""
         record, sealed = self.find(key), _arrays(self._maps_path(key), "the maps of a run").get("record")
         return record is not None and sealed is not None and str(sealed) == record.sha256
 
@@ -109,6 +109,6 @@ def _arrays(path: Path, expected: str) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as file:
             return dict(file)
-    except Exception as error:  # NumPy and zipfile raise many kinds of error for a damaged file
+    except Exception as error:  # NumPy, zipfile and zlib raise many types for damaged files
         found = " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(f"{path}: expected {expected}, found {found}") from None

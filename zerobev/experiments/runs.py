@@ -1,7 +1,6 @@
 """A run: one row of a table with one seed, from its configuration to its record.
 
-If several processes compute a run together (`accelerate launch`), they share training and evaluation, and the first
-one writes.
+With several processes (`accelerate launch`), all share training and evaluation, and rank 0 writes.
 """
 
 import time
@@ -46,7 +45,7 @@ from zerobev.training.loader import Batch, Source, batches
 from zerobev.training.monitor import maps_figure
 from zerobev.training.train import dice_objective, train
 
-#: Of the reference runs; the first one is computed if it is missing.
+#: Seeds of the reference runs; only the first is computed if it is missing.
 SEEDS = (0, 1, 2)
 VALIDATION_BATCHES = 4
 _EVALUATION_BATCH = 16
@@ -54,7 +53,7 @@ _EVALUATION_BATCH = 16
 
 @dataclass(frozen=True)
 class Run:
-    """An experiment with the data of a workspace and one seed: its key, training and record."""
+    """An experiment on the data of a workspace with one seed."""
 
     experiment: Experiment
     workspace: Workspace
@@ -77,7 +76,7 @@ class Run:
 
     @cached_property
     def key(self) -> str:
-        """Name of the run: row, seed, and the fingerprint of its configuration."""
+        """Row, seed, and fingerprint of the configuration."""
         return key_of(f"{self.experiment.row}-seed{self.seed}", self.config)
 
     @property
@@ -87,22 +86,22 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Checkpoint, logs and weights."""
+        """Folder of checkpoint, logs and weights."""
         return self.workspace.runs / self.key
 
     @property
     def weights(self) -> Path:
-        """The trained network, once it is trained on this machine."""
+        """File of the trained network; missing until it is trained on this machine."""
         return self.folder / "model.safetensors"
 
     @cached_property
     def pretraining(self) -> DepthPretraining:
-        """The depth estimator."""
+        """The workspace's depth estimator."""
         return DepthPretraining(self.workspace)
 
     @property
     def backbone(self) -> str:
-        """Source of the first weights of the network's RGB backbone; empty: the depth estimator."""
+        """Source of the initial weights of the RGB backbone; "" is the depth estimator."""
         scale = self.workspace.scale
         is_vpn = self.experiment.network is not None and VARIANTS[self.experiment.network][0] is VPN
         return scale.vpn_backbone if is_vpn else scale.backbone
@@ -114,14 +113,14 @@ class Run:
     def record(self) -> RunRecord:
         """Its record: read, or computed now.
 
-        A computation that was stopped goes on from its checkpoint. Training takes the training and validation scenes;
-        the test scenes are used once, by the weights with the best validation score.
+        An interrupted computation continues from its checkpoint. Training uses the training and validation scenes; the
+        weights with the best validation score are evaluated once on the test scenes.
         """
         return self.recorded() or self.compute(self.store)
 
     def compute(self, store: RunStore) -> RunRecord:
-        """Train, evaluate and write the record into `store`, whether it is there or not."""
-        revision = git_revision()  # of the running code, whatever is committed in the meantime
+        """Train, evaluate and write the record into `store`, even if it exists."""
+        revision = git_revision()  # of the running code, before later commits
         camera = self.workspace.scale.camera
         history: History | None = None
         if self.experiment.network is None:
@@ -159,10 +158,10 @@ class Run:
         return record
 
     def train(self) -> tuple[BevModel, History]:
-        """The network with its best weights; also written to `weights`.
+        """The network with its best weights, and its training history; the network is also written to `weights`.
 
-        Its RGB backbone starts from the scale's pretrained weights, everything else from the seed. Validation is on the
-        stream of its training, with the depth of the last stage and a fixed seed, so that scores of runs compare.
+        The RGB backbone starts from pretrained weights, the rest from the seed. Validation uses the stream of training,
+        the depth of the last stage and a fixed seed, so that scores of runs are comparable.
         """
         wanted, scale, config = self.experiment, self.workspace.scale, self.workspace.scale.train
         assert wanted.network is not None  # P^-1 is not trained
@@ -189,7 +188,7 @@ class Run:
         return model, history
 
     def source(self, split: Split, depth: Depth, seed: int) -> Source:
-        """The samples of a split for its training."""
+        """Training samples of a split."""
         wanted, workspace, scale = self.experiment, self.workspace, self.workspace.scale
         views = self.views(split, depth)
         common = (scale.camera, seed, scale.train.batch, wanted.empty_fraction(scale))
@@ -207,13 +206,13 @@ class Run:
 
 
 def recorded(rows: Iterable[str], workspace: Workspace) -> list[RunRecord]:
-    """The records of rows, with every seed of `SEEDS` that is recorded; nothing is computed."""
+    """The existing records of rows, with all seeds of `SEEDS`; nothing is computed."""
     runs = [Run(experiment(row), workspace, seed) for row in dict.fromkeys(rows) for seed in SEEDS]
     return [record for record in (run.recorded() for run in runs) if record is not None]
 
 
 def records_of(rows: Iterable[str], workspace: Workspace) -> list[RunRecord]:
-    """As `recorded`, after the first seed of each row was computed if it was missing."""
+    """As `recorded`, after the first seed of each row is computed if it is missing."""
     rows = list(rows)
     for row in rows:
         Run(experiment(row), workspace, SEEDS[0]).record()
@@ -221,17 +220,17 @@ def records_of(rows: Iterable[str], workspace: Workspace) -> list[RunRecord]:
 
 
 class InTurn:
-    """Training data of several stages, one after the other, each with an equal part of the steps."""
+    """Training data in stages, one after the other, with the same number of steps each."""
 
     def __init__(self, stages: list[Source], steps: int) -> None:
         self._stages, self._steps = stages, steps
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> Batch:
-        """The batch of a step, from the stage that the step belongs to."""
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> Batch:
+        """The batch of a step, from the stage of that step."""
         stage = self._stages[min(step * len(self._stages) // self._steps, len(self._stages) - 1)]
-        return stage.batch(step, rank, ranks)
+        return stage.batch(step, rank, world_size)
 
 
 def _projection(camera: CameraConfig) -> Predictor:
-    """Rows (a): P^-1 with the depth of the batch."""
+    """P^-1 with the depth of the batch, rows (a)."""
     return lambda batch: inverse_project(batch["zero"], batch["depth"], camera) > 0

@@ -1,8 +1,9 @@
 """The data of one scale on this machine: scenes, views and textures, made at their first use.
 
-All of it can be made again and lies in the ignored folder `.cache`; results lie in `reports`.
+Data lie in the ignored folder `.cache` and can be made again; results lie in `reports`.
 """
 
+import argparse
 import os
 from collections.abc import Sequence
 from functools import cached_property
@@ -14,9 +15,9 @@ import numpy as np
 from zerobev import config
 from zerobev.common.errors import InputError
 from zerobev.common.keys import fingerprint
-from zerobev.common.paths import zerobev_home
+from zerobev.common.paths import report_name, zerobev_home
 from zerobev.common.settings import changed_by
-from zerobev.config import SPLITS, Split, TextureConfig
+from zerobev.config import SCALES, SPLITS, Split, TextureConfig
 from zerobev.data.generate import generate, shard_path
 from zerobev.data.patterns import SourceImages
 from zerobev.data.samples import ViewSet
@@ -29,16 +30,23 @@ from zerobev.scenes.readers import read_scene, split_scenes
 from zerobev.scenes.scene import Scene
 
 
+def add_workspace_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of a command that choose its workspace."""
+    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
+    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+
+
 class Workspace:
     """Scenes, views and textures of a scale, from generated homes or from a folder of scenes."""
 
     def __init__(self, scale: str, scenes: str = "", root: Path | None = None, settings: Sequence[str] = ()) -> None:
-        """Choose the scale and the scenes; nothing is made yet.
+        """Choose scale and scenes; nothing is made yet.
 
         scale: a name in `config.SCALES`
         scenes: a folder in HM3DSem layout; "" for generated homes
         root: the folder of `.cache` and `reports`; default: `common.paths.zerobev_home()`
-        settings: values of the scale that are changed, such as `train.steps=2400`, see `common.settings`
+        settings: changed values of the scale, such as `train.steps=2400`, see `common.settings`
+        Raises `InputError` for an unknown scale or setting, or a missing folder.
         """
         root = root or zerobev_home()
         self._arguments = scale, scenes, root
@@ -47,7 +55,7 @@ class Workspace:
         self.source = Path(scenes).expanduser().resolve() if scenes else None
         if self.source and not self.source.is_dir():
             raise InputError(f"scenes: expected a folder in HM3DSem layout, found nothing at {scenes}")
-        self.reports = root / "reports" / (f"{scale}-{self.source.name}-scenes" if self.source else scale)
+        self.reports = root / "reports" / report_name(scale, self.source)
         textures = os.environ.get("ZEROBEV_TEXTURES")  # set by `make reproduce TEXTURES=...`
         self._textures = Path(textures) if textures else None
         self.cache = root / ".cache"
@@ -59,7 +67,7 @@ class Workspace:
 
     @cached_property
     def data_config(self) -> dict[str, Any]:
-        """Everything that the views depend on: a part of the configuration of every run."""
+        """Everything that the views depend on; part of the configuration of every run."""
         found = {
             "version": versions.DATA,
             **recorded_with(self.scale.camera, self.scale.texture),
@@ -83,12 +91,12 @@ class Workspace:
 
     @cached_property
     def views_folder(self) -> Path:
-        """Folder of the shards, a folder per split in it."""
+        """Folder of the shards, with a folder per split."""
         return self.cache / f"views-{fingerprint(self.data_config)}"
 
     @property
     def split(self) -> SceneFolders:
-        """Folders of the training, validation and test scenes; generated ones may not be written yet."""
+        """Folders of the training, validation and test scenes; those of generated homes may not exist yet."""
         if self.source:
             return split_scenes(self.source)
         return home_folders(self.cache / f"homes-{versions.DATA}-{self.scale.scenes.seed}", self.scale.scenes)
@@ -101,9 +109,9 @@ class Workspace:
         return read_scene(folder)
 
     def views(self, split: Split, scenes: int | None = None) -> ViewSet:
-        """The recorded views of the first `scenes` scenes of a split (default: all), recorded now if missing.
+        """Views of the first `scenes` scenes of a split (default: all); missing shards are made now.
 
-        Raises `InputError` that names the scenes which could not be recorded.
+        Raises `InputError` with the scenes that failed.
         """
         folders = list(self.split.of(split)[:scenes])
         seed = self.scale.scenes.seed + config.SPLITS.index(split)
@@ -118,7 +126,7 @@ class Workspace:
         return ViewSet([Shard(shard_path(f, out), self.scale.camera, self.scale.texture) for f in folders])
 
     def bank(self, texture: TextureConfig | None = None) -> TextureBank:
-        """A texture bank, by default of this scale's textures; from DTD's images or procedural ones."""
+        """A texture bank, by default of this scale's textures, from DTD's images or procedural images."""
         texture = texture or self.scale.texture
         path = self.cache / f"textures-{fingerprint(self.texture_config(texture))}.npz"
         if not path.exists():

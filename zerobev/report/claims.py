@@ -1,7 +1,7 @@
-"""The paper's claims held against our records: holds, does not hold, or undecided - computed, never typed.
+"""Verdicts on the paper's claims, computed from our records: holds, does not hold, or undecided.
 
-What is judged is the order of rows, the sign of a gain, the spread of several rows; not absolute numbers, since the
-scenes differ. A verdict stands on means over seeds with a 90 % bootstrap interval over test scenes and seeds.
+Claims are about the sign of a gain or the spread of several rows, not about absolute numbers, since the scenes differ.
+A verdict uses means over seeds with a 90 % bootstrap interval over test scenes and seeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,15 +12,13 @@ import numpy as np
 
 from zerobev.common.errors import InputError
 from zerobev.config import LABELS
-from zerobev.evaluation.metrics import Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
+from zerobev.evaluation.metrics import DRAWS, INTERVAL, Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
 from zerobev.experiments.run_records import RunRecord
 from zerobev.report.paper import TABLES, Ordering, Ratio, Row, Similar
 
-_DRAWS = 1000
-_LEVEL = 0.9
 _OBJECTS = [LABELS.index(name) for name in LABELS if name not in ("wall", "floor")]
 
-#: From the statistic of every row that a claim names, (..., rows), to the number that is judged, (...).
+#: From the statistic of each row of a claim, (..., rows), to the number to be judged, (...).
 Measure = Callable[[np.ndarray], np.ndarray]
 
 
@@ -30,12 +28,12 @@ VERDICTS: tuple[VerdictName, ...] = get_args(VerdictName)
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim of the paper, held against our records."""
+    """A claim, and the result of our records."""
 
     id: str
     table: int
     claim: str
-    paper: float | None  #: IoU points; None where the paper has no such row
+    paper: float | None  #: IoU points; None if the paper has no such row
     ours: float | None
     low: float | None  #: 90 % interval over test scenes and seeds
     high: float | None
@@ -43,12 +41,13 @@ class Verdict:
 
 
 def judge(claim: Ordering | Similar, records: Sequence[RunRecord]) -> Verdict:
-    """Whether a claim of the paper holds here too, or one of `zerobev.report.own_rows` at all.
+    """The verdict on a claim of the paper or of `zerobev.report.own_rows`.
 
-    An ordering holds where the interval of the paired gain lies above zero, and does not where it lies below. Rows
-    are similar where the interval of their spread lies below the claim's `points`, and are not where it lies above.
-    Records of other rows are left aside; those of the claim's rows must be of the same test scenes, else it is an
-    `InputError`.
+    An ordering holds if the interval of the paired gain lies above zero, and does not hold if it lies below. A
+    similarity holds if the interval of the rows' spread lies below the claim's `points`, and does not hold if it lies
+    above. All else is undecided. Records of other rows are ignored.
+
+    Raises `InputError` for records of different test scenes.
     """
     rows, measure = _measured(claim)
     published = TABLES.get(claim.table, {})
@@ -70,7 +69,7 @@ def judge(claim: Ordering | Similar, records: Sequence[RunRecord]) -> Verdict:
 
 
 def compare(ratio: Ratio, records: Sequence[RunRecord]) -> dict[str, str | float | None]:
-    """A quotient of two rows in the paper and here, with our 90 % interval; None where a row was not run."""
+    """A quotient of two rows in the paper and here, with our 90 % interval; None if a row has no record."""
     rows = (ratio.numerator, ratio.denominator)
     published = [_published(TABLES[1][row], ratio.metric) for row in rows]
     found = _measure(rows, ratio.metric, lambda values: values[..., 0] / values[..., 1], records)
@@ -79,7 +78,7 @@ def compare(ratio: Ratio, records: Sequence[RunRecord]) -> dict[str, str | float
 
 
 def _measured(claim: Ordering | Similar) -> tuple[tuple[str, ...], Measure]:
-    """The rows that a claim is about, and what is measured of them."""
+    """The rows of a claim, and the number to be judged."""
     if isinstance(claim, Ordering):
         return (claim.better, claim.worse), lambda values: values[..., 0] - values[..., 1]
     return claim.rows, lambda values: values.max(axis=-1) - values.min(axis=-1)
@@ -94,7 +93,7 @@ def _named(claim: Ordering | Similar) -> str:
 def _measure(
     rows: Sequence[str], metric: str, measure: Measure, records: Sequence[RunRecord]
 ) -> tuple[float, float, float] | None:
-    """The measured value and its interval; None where a row has no record."""
+    """The measured value and the ends of its interval; None if a row has no record."""
     runs = {row: [record for record in records if record.row == row] for row in rows}
     if not all(runs.values()):
         return None
@@ -103,8 +102,8 @@ def _measure(
     statistic = _statistic(metric)
     counts = [[run.counts for run in runs[row]] for row in rows]
     whole = measure(np.array([np.mean([one.value(statistic) for one in seeds]) for seeds in counts]))
-    draws = measure(np.stack(resampled_scenes(counts, statistic, np.random.default_rng(0), _DRAWS), axis=-1))
-    low, high = np.nanquantile(draws, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+    draws = measure(np.stack(resampled_scenes(counts, statistic, np.random.default_rng(0), DRAWS), axis=-1))
+    low, high = np.nanquantile(draws, INTERVAL)
     return float(whole), float(low), float(high)
 
 

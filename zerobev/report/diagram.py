@@ -1,7 +1,4 @@
-"""A network drawn from the live model: its blocks in the order of a pass, with the shapes that leave them.
-
-The figure is read off a forward pass, so that it cannot say anything else than the code does.
-"""
+"""A network drawn from the live model: its blocks in the order of a forward pass, with the shapes of their outputs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,22 +12,22 @@ from torch import Tensor, nn
 
 _FILL = {"backbone": "#cfe2f3", "zero_cnn": "#fce5cd", "decoder": "#d9ead3"}
 _OTHER = "#eeeeee"
-_STEP = 1.25  # from one box to the next, in widths of a box
+_STEP = 1.25  # between two boxes, in widths of a box
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A block of a network, as a pass went through it."""
+    """A block of a network in a forward pass."""
 
     name: str
-    shapes: tuple[tuple[int, ...], ...]  #: of what leaves it, without the batch axis
+    shapes: tuple[tuple[int, ...], ...]  #: of its outputs, without the batch axis
     parameters: int
 
 
 def stages(network: nn.Module, *inputs: Tensor) -> list[Stage]:
-    """The blocks of `network` (its direct children) in the order in which a pass with `inputs` leaves them.
+    """The blocks of `network` (its direct children) in the order of their outputs in a pass with `inputs`.
 
-    A block that is called more than once, such as each of a list of layers, gives one stage with all its shapes.
+    A block with several outputs or calls, such as a list of layers, is one stage with all shapes.
     """
     shapes: dict[str, list[tuple[int, ...]]] = {}
 
@@ -58,7 +55,7 @@ def stages(network: nn.Module, *inputs: Tensor) -> list[Stage]:
 
 
 def draw_networks(networks: Sequence[tuple[str, Sequence[Stage]]]) -> Figure:
-    """One line of boxes a network, each with its title; boxes hold name, parameters, and channels x rows x columns."""
+    """One line of boxes per network, with its title; a box shows name, parameters, and channels x rows x columns."""
     longest = max(len(blocks) for _, blocks in networks)
     size = (1.75 * longest, 1.65 * len(networks))
     figure, axes = plt.subplots(len(networks), figsize=size, squeeze=False, layout="constrained")
@@ -66,11 +63,11 @@ def draw_networks(networks: Sequence[tuple[str, Sequence[Stage]]]) -> Figure:
         axis.set_title(title, fontsize=9, loc="left")
         axis.set(xlim=(-0.05, _STEP * longest), ylim=(0, 1))
         axis.set_axis_off()
-        for place, block in enumerate(blocks):
-            _box(axis, _STEP * place, block)
-            if place:
+        for index, block in enumerate(blocks):
+            _box(axis, _STEP * index, block)
+            if index:
                 arrow = {"arrowstyle": "->", "linewidth": 0.8}
-                axis.annotate("", (_STEP * place, 0.5), (_STEP * (place - 1) + 1, 0.5), arrowprops=arrow)
+                axis.annotate("", (_STEP * index, 0.5), (_STEP * (index - 1) + 1, 0.5), arrowprops=arrow)
     return figure
 
 

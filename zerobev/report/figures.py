@@ -1,13 +1,14 @@
-"""Figures that notebooks and the page of results share."""
+"""Figures of the notebooks and the page of results."""
 
 from collections.abc import Collection, Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from zerobev.config import LABELS, CameraConfig
+from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
 from zerobev.experiments.run_records import RunRecord
 from zerobev.geometry.cameras import Pose
@@ -16,37 +17,34 @@ from zerobev.report.paper import TABLES
 from zerobev.report.tables import rows_of
 from zerobev.scenes.scene import Scene
 
-#: One colour a class, in the order of `LABELS`; what is none of them is light grey.
+#: One colour per class, in the order of `LABELS`.
 COLORS = ("#4c566a", "#c9b79c", "#e07a1f", "#3a7d44", "#2f6db5", "#7cc36e", "#b04fb0", "#d62839")
-_NOTHING = "#ececec"
-_OUTSIDE = "#ffffff"
+#: (9, 3) uint8: these, then light grey for `NO_LABEL`.
+_PALETTE = (255 * to_rgba_array([*COLORS, "#ececec"])[:, :3]).round().astype(np.uint8)
 
 
 def label_image(label: np.ndarray, fov: np.ndarray | None = None) -> np.ndarray:
-    """(H, W) labels -> (H, W, 3) colours; what lies outside `fov` is white."""
-    palette = np.array([*(_rgb(color) for color in COLORS), _rgb(_NOTHING)])
-    image = palette[label]
-    return image if fov is None else np.where(fov[..., None], image, _rgb(_OUTSIDE))
+    """(H, W) labels -> (H, W, 3) uint8 colours; white outside `fov`."""
+    image = _PALETTE[label]
+    return image if fov is None else np.where(fov[..., None], image, np.uint8(255))
 
 
 def maps_image(maps: np.ndarray, fov: np.ndarray) -> np.ndarray:
-    """Predicted masks (8, M, M) -> (M, M, 3) colours; where masks overlap, the later class is drawn on top."""
-    label = np.full(maps.shape[1:], len(LABELS))
-    for index, mask in enumerate(maps):
-        if LABELS[index] != "floor":  # floor is below everything that stands on it
-            label = np.where(mask, index, label)
-    label = np.where((label == len(LABELS)) & maps[LABELS.index("floor")], LABELS.index("floor"), label)
+    """Predicted masks (8, M, M) -> (M, M, 3) uint8 colours; later classes lie above earlier ones, floor below all."""
+    label = np.full(maps.shape[1:], NO_LABEL)
+    for index in sorted(range(len(LABELS)), key=lambda index: LABELS[index] != "floor"):
+        label[maps[index]] = index
     return label_image(label, fov)
 
 
 def flat(masks: np.ndarray) -> np.ndarray:
-    """(K, H, W) bool as one picture, (H, W) in [0, 1]: each mask in a grey of its own, later ones on top."""
+    """(K, H, W) bool -> one image (H, W) in [0, 1]: one grey per mask, brighter for earlier masks."""
     grey = np.linspace(0.4, 1, len(masks))[::-1] if len(masks) else np.zeros(0)
     return np.max(masks * grey[:, None, None], axis=0, initial=0)
 
 
 def averages_figure(number: int, records: Sequence[RunRecord]) -> Figure:
-    """Both averages of each row of a table: ours with 90 % intervals over scenes and seeds, the paper's as crosses."""
+    """Both averages per row of a table: ours with 90 % intervals over scenes and seeds, the paper's as crosses."""
     rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
     figure, panels = plt.subplots(1, 2, figsize=(8, 0.9 + 0.28 * len(rows)), sharey=True)
     for axes, (name, statistic) in zip(panels, {"class": class_iou, "pixel": pixel_iou}.items()):
@@ -66,24 +64,27 @@ def averages_figure(number: int, records: Sequence[RunRecord]) -> Figure:
     return figure
 
 
-def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarray], side: float = 1.2) -> Figure:
-    """Views of test homes, one a line: photograph, its labels, the maps of each row, and the truth.
+def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarray]) -> Figure:
+    """One line per view of the test scenes: photograph, its labels, the maps of each row, and the true map.
 
-    views: as `zerobev.experiments.gallery.gallery` returns them
-    maps: row -> (N, 8, M, M) bool, as `RunStore.maps` returns them
+    views: see `zerobev.experiments.gallery.gallery`
+    maps: row -> (N, 8, M, M) bool, see `RunStore.maps`
     """
     truth = [label_image(label, fov) for label, fov in zip(views["bev_label"], views["fov"])]
     predicted = [
         (f"({row})", [maps_image(m, fov) for m, fov in zip(masks, views["fov"])]) for row, masks in maps.items()
     ]
     labels = [label_image(label) for label in views["fpv_label"]]
-    figure = grid([("photograph", views["rgb"]), ("FPV labels", labels), *predicted, ("truth", truth)], side)
+    figure = grid([("photograph", views["rgb"]), ("FPV labels", labels), *predicted, ("truth", truth)], side=1.2)
     add_legend(figure)
     return figure
 
 
 def grid(columns: Sequence[tuple[str, Collection[np.ndarray]]], side: float = 1.5) -> Figure:
-    """A figure of image columns, each with a title and one image a row; 2-D images are shown in grey."""
+    """A figure of image columns, each with a title and one image per row; 2-D images are grey.
+
+    side: of an image, inches
+    """
     rows = len(columns[0][1])
     figure, axes = plt.subplots(rows, len(columns), figsize=(side * len(columns), side * rows + 0.3), squeeze=False)
     for j, (title, images) in enumerate(columns):
@@ -96,22 +97,18 @@ def grid(columns: Sequence[tuple[str, Collection[np.ndarray]]], side: float = 1.
 
 
 def add_legend(figure: Figure) -> None:
-    """The eight classes and their colours, below a figure."""
+    """Add the eight classes and their colours below a figure."""
     patches = [Patch(color=color, label=name) for name, color in zip(LABELS, COLORS)]
     figure.legend(handles=patches, loc="lower center", ncols=len(LABELS), fontsize=7, bbox_to_anchor=(0.5, -0.04))
 
 
-def top_view(scene: Scene, cell_m: float = 0.05) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """The whole home from above: (M, M) int8 labels, and the `extent` in world metres for `imshow`."""
+def top_view(scene: Scene) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """The scene from above in cells of 5 cm: (M, M) int8 labels, and the `extent` for `imshow`, world metres."""
     low, high = scene.vertices[:, :2].min(axis=0), scene.vertices[:, :2].max(axis=0)
     side_m = float((high - low).max())
-    # a BEV camera large enough for the home, standing at the middle of its southern edge and looking north
-    camera = CameraConfig(fpv_px=1, bev_px=round(side_m / cell_m), bev_extent_m=side_m)
+    # a BEV camera with a map of that size, at the middle of the southern edge, facing north
+    camera = CameraConfig(fpv_px=1, bev_px=round(side_m / 0.05), bev_extent_m=side_m)
     middle = float((low[0] + high[0]) / 2)
     seen = RayCaster(scene).bev(Pose(middle, float(low[1]), float(scene.vertices[:, 2].min()), np.pi / 2), camera)
     extent = (middle - side_m / 2, middle + side_m / 2, float(low[1]), float(low[1]) + side_m)
     return scene.instance_label[seen.instance], extent
-
-
-def _rgb(color: str) -> np.ndarray:
-    return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)], np.uint8)

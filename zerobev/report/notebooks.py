@@ -1,9 +1,8 @@
 """Run the whole workbook.
 
-Reads `notebooks/` and the records of `reports/<report>/`; writes the executed copies and their HTML into
-`reports/<report>/notebooks/`, and messages of kernels into `reports/<report>/logs/`. Every notebook is executed in
-order, with the scale and the scenes as its parameters. After an interruption the same command goes on: recorded results
-are read.
+Reads `notebooks/` and the records of `reports/<report>/`; writes executed copies and their HTML into
+`reports/<report>/notebooks/`, and messages of kernels into `reports/<report>/logs/`. Notebooks run in order, with scale
+and scenes as parameters. After an interruption the same command continues with the recorded results.
 """
 
 import argparse
@@ -26,7 +25,7 @@ from nbformat import NotebookNode
 from papermill.exceptions import PapermillExecutionError
 
 from zerobev.common.errors import InputError
-from zerobev.common.paths import PACKAGE_PARENT, zerobev_home
+from zerobev.common.paths import PACKAGE_PARENT, report_name, zerobev_home
 from zerobev.common.storage import replacing
 from zerobev.config import SCALES, one_of
 
@@ -34,20 +33,15 @@ NOTEBOOKS = PACKAGE_PARENT / "notebooks"
 
 
 class NotebookError(Exception):
-    """A notebook did not run through; the message names the notebook, the cell and the error."""
-
-
-def report_name(scale: str, scenes: Path | None) -> str:
-    """Name of the folder in `reports/`: the scale's, or `<scale>-<folder>-scenes` for scenes read from a folder."""
-    return scale if scenes is None else f"{scale}-{scenes.resolve().name}-scenes"
+    """A notebook failed; the message names the notebook, the cell and the error."""
 
 
 def kernel_settings() -> dict[str, str]:
-    """Environment variables of every notebook kernel; the folders they name are made.
+    """Environment variables of notebook kernels; the folders they name are made.
 
-    They name this environment's own kernel, let figures appear in the notebook, and let kernels find the package and
-    `zerobev_home()` from any folder. Jupyter, IPython and matplotlib write inside `zerobev_home()`, so that neither
-    the user's settings nor a home directory without write access change an output.
+    They select this environment's kernel, figures inside the notebook, the package and `zerobev_home()`. Jupyter,
+    IPython and matplotlib read and write inside `zerobev_home()`: the user's settings do not change outputs, and the
+    home directory may be read-only.
     """
     own = {
         "JUPYTER_CONFIG_DIR": "jupyter/config",
@@ -65,7 +59,7 @@ def kernel_settings() -> dict[str, str]:
         "ZEROBEV_HOME": str(zerobev_home()),
         "PYTHONPATH": os.pathsep.join([str(PACKAGE_PARENT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
-        # a progress bar of Jupyter widgets is not wanted, so that it cannot be had is no news
+        # progress bars use no Jupyter widgets
         "PYTHONWARNINGS": "ignore:IProgress not found",
         "TOKENIZERS_PARALLELISM": os.environ.get("TOKENIZERS_PARALLELISM", "false"),
     }
@@ -73,7 +67,7 @@ def kernel_settings() -> dict[str, str]:
 
 @contextlib.contextmanager
 def environment(variables: dict[str, str]) -> Iterator[None]:
-    """Set environment variables, for kernels to inherit, and restore all of them at the end."""
+    """Set environment variables, which kernels inherit, and restore all variables at the end."""
     before = dict(os.environ)
     os.environ.update(variables)
     try:
@@ -85,7 +79,7 @@ def environment(variables: dict[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def only_run(logs: Path) -> Iterator[None]:
-    """Hold the folder `logs` (made if missing) for this process; an `InputError` if another process holds it."""
+    """Lock the folder `logs`, made if missing. Raises `InputError` if another process has locked it."""
     logs.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(logs / ".lock", blocking=False):
@@ -96,7 +90,7 @@ def only_run(logs: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def shown_progress(file: Path) -> Iterator[None]:
-    """Let kernels write the progress of long work to `file`, and pass it on to the terminal, if there is one."""
+    """Kernels write the progress of long work to `file`; it is copied to the terminal, if there is one."""
     file.write_text("")
     done = threading.Event()
     terminal = os.dup(2)
@@ -121,7 +115,7 @@ def shown_progress(file: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def standard_error_in(log: Path) -> Iterator[None]:
-    """Let file descriptor 2, of this process and of the kernels it starts, write to the end of `log`."""
+    """Redirect file descriptor 2 of this process, and of kernels it starts, to the end of `log`."""
     sys.stderr.flush()
     terminal = os.dup(2)
     with log.open("ab") as file:
@@ -135,10 +129,10 @@ def standard_error_in(log: Path) -> Iterator[None]:
 
 
 def execute(notebook: Path, executed: Path, logs: Path, parameters: dict[str, str]) -> NotebookNode:
-    """Execute `notebook` with `parameters`, from `zerobev_home()`, and write it to `executed` when it ran through.
+    """Execute `notebook` with `parameters` in `zerobev_home()`, and write it to `executed` if it succeeds.
 
-    The output streams of its cells and the messages of its kernel go to `logs/<notebook>.log`, and on failure the
-    traceback too. Raises `NotebookError`; then `executed` is not touched.
+    Output streams of cells, messages of the kernel, and the traceback of a failure go to `logs/<notebook>.log`.
+    Raises `NotebookError`; then `executed` is unchanged.
     """
     logs.mkdir(parents=True, exist_ok=True)
     log = logs / f"{notebook.stem}.log"
@@ -167,7 +161,7 @@ def execute(notebook: Path, executed: Path, logs: Path, parameters: dict[str, st
 
 
 def _stopped_at(unfinished: Path) -> str:
-    """Number, among the author's code cells, and first line of the last cell that was started."""
+    """Number and first line of the last code cell that was started; the injected cell does not count."""
     code = [cell for cell in nbformat.read(unfinished, as_version=4).cells if cell.cell_type == "code"]
     code = [cell for cell in code if "injected-parameters" not in cell.metadata.get("tags", [])]
     started = [cell for cell in code if cell.metadata.papermill.start_time]
@@ -177,7 +171,7 @@ def _stopped_at(unfinished: Path) -> str:
 
 
 def write_page(notebook: NotebookNode, page: Path, log: Path) -> None:
-    """Write an executed notebook as HTML; the converter's remarks go to `log`."""
+    """Write an executed notebook as HTML; messages of the converter go to `log`."""
     with replacing(page) as unfinished, standard_error_in(log):
         unfinished.write_text(HTMLExporter().from_notebook_node(notebook)[0], encoding="utf-8")
 
@@ -190,7 +184,7 @@ def _notebooks_in(folder: Path) -> list[Path]:
 
 
 def _progress(notebooks: list[Path]) -> Iterator[Path]:
-    """Yield each notebook; print its name when it starts, the seconds it took when it is done, and the total."""
+    """Yield each notebook; print its name at the start, its seconds at the end, and the total."""
     begin = time.monotonic()
     for number, notebook in enumerate(notebooks, start=1):
         start = time.monotonic()
@@ -210,12 +204,12 @@ def reproduce(
 ) -> Path:
     """Execute every notebook of the folder `notebooks`, in order of name, and return the report's folder.
 
-    scale: name of a scale, the notebooks' parameter `SCALE`.
-    scenes: folder of HM3DSem scenes, the parameter `SCENES` as an absolute path; None (`""`) is generated homes.
-    textures: folder of texture images; kernels find it in the environment variable `ZEROBEV_TEXTURES`.
-    reports: folder of the reports; default: `reports` in `common.paths.zerobev_home()`.
-    fresh: compute again what is recorded; kernels find the time of this call, in seconds since 1970, in
-        `ZEROBEV_FRESH`, and take no record that is older.
+    scale: name of a scale, the notebooks' parameter `SCALE`
+    scenes: folder of HM3DSem scenes, the parameter `SCENES` as an absolute path; None (`""`): generated homes
+    textures: folder of texture images, passed to kernels in the environment variable `ZEROBEV_TEXTURES`
+    fresh: compute all records again; kernels ignore records older than `ZEROBEV_FRESH`, the time of this call in
+        seconds since 1970
+    reports: folder of the reports; default: `reports` in `common.paths.zerobev_home()`
     Raises `InputError` before anything is executed, `NotebookError` at the first notebook that fails.
     """
     one_of("scale", scale, SCALES)
@@ -235,7 +229,7 @@ def reproduce(
     report = (reports or zerobev_home() / "reports") / report_name(scale, scenes)
     executed, logs = report / "notebooks", report / "logs"
     with only_run(logs), environment(variables), shown_progress(logs / "progress.log"):
-        shutil.rmtree(executed, ignore_errors=True)  # copies of an earlier run would pass for this one's
+        shutil.rmtree(executed, ignore_errors=True)  # of an earlier run
         for notebook in _progress(sources):
             copy = execute(notebook, executed / notebook.name, logs, parameters)
             write_page(copy, executed / f"{notebook.stem}.html", logs / f"{notebook.stem}.log")
@@ -243,17 +237,17 @@ def reproduce(
 
 
 def first_picture(notebook: NotebookNode) -> bytes | None:
-    """The first figure among a notebook's outputs, as PNG; None if it has none."""
+    """The first figure of a notebook's outputs, as PNG; None if there is none."""
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     pictures = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
     return base64.b64decode(pictures[0]) if pictures else None
 
 
 def refresh(notebooks: Path = NOTEBOOKS, reports: Path = PACKAGE_PARENT / "reports") -> None:
-    """Execute every notebook of the folder again with its own parameters and put it, whole and clean, in its place.
+    """Execute all notebooks of the folder with their own parameters, and replace each by its executed copy.
 
-    Clean: no trace of when and by what a notebook was executed, so that equal outputs are equal files. The first
-    picture of the first notebook, the tour, is the README's: it goes to `reports/tour.png`.
+    Copies have no metadata of their execution, so equal outputs give equal files. The first figure of the first
+    notebook, the tour, is copied to `reports/tour.png` for the README.
     """
     cache = zerobev_home() / ".cache/notebooks"
     with only_run(cache), environment(kernel_settings()):

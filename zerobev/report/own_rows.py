@@ -1,4 +1,4 @@
-"""What this project adds to the paper's tables, as data: rows, and what is expected of them."""
+"""Rows and claims that this project adds to the paper's tables, as data."""
 
 from zerobev.report.paper import Ordering
 
@@ -17,7 +17,7 @@ OWN_ROWS: dict[int, dict[str, str]] = {
     },
 }
 
-#: Ids begin with the table in which the rows stand.
+#: Ids begin with the number of the table.
 OWN_CLAIMS: tuple[Ordering, ...] = (
     Ordering("2.f1", "class", "attention that max-pools beats attention that averages", "f", "c"),
     Ordering("2.f2", "class", "... and the inductive bias", "f", "e"),

@@ -1,8 +1,7 @@
 """Write all tables, verdicts and figures of a report, and one page that shows them.
 
-Reads the records of `reports/<report>/`; writes there `index.html`, readable without Jupyter, `tables/*.csv`,
-`claims.json`, `ratios.json` and `figures/*.png`. Nothing is computed: a row without a record shows the paper's numbers
-alone.
+Reads the records of `reports/<report>/`; writes `index.html`, `tables/*.csv`, `claims.json`, `ratios.json` and
+`figures/*.png` there. No row is computed: a row without a record shows only the paper's numbers.
 """
 
 import argparse
@@ -16,7 +15,7 @@ from typing import Any
 import jinja2
 import matplotlib
 
-matplotlib.use("Agg")  # pictures go to files, with or without a display
+matplotlib.use("Agg")  # figures go to files; no display is needed
 
 import matplotlib.pyplot as plt
 import nbformat
@@ -24,12 +23,11 @@ import pandas as pd
 
 from zerobev.common.paths import PACKAGE_PARENT
 from zerobev.common.storage import replacing, write_json
-from zerobev.config import SCALES
 from zerobev.experiments.gallery import gallery
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.experiments.runs import SEEDS, recorded
-from zerobev.experiments.workspace import Workspace
+from zerobev.experiments.workspace import Workspace, add_workspace_arguments
 from zerobev.report.claims import VERDICTS, compare, judge
 from zerobev.report.figures import averages_figure, gallery_figure
 from zerobev.report.own_rows import OWN_CLAIMS
@@ -45,11 +43,11 @@ TABLES = {
     5: "Table 5: how the zero-shot stream is made",
     6: "Beyond the paper: scale and freshness of the textures",
 }
-_SHOWN = ("a.1", "a.2", "b.3", "c", "d", "f", "f.r")  #: rows of the gallery, where they are recorded
+_SHOWN = ("a.1", "a.2", "b.3", "c", "d", "f", "f.r")  #: rows of the gallery, if they are recorded
 
 
 def write_summary(workspace: Workspace) -> Path:
-    """Write everything; returns the path of the page."""
+    """Write all files; returns the path of the page."""
     records = recorded(EXPERIMENTS, workspace)
     verdicts = [judge(claim, records) for claim in (*CLAIMS, *OWN_CLAIMS)]
     ratios = [compare(ratio, records) for ratio in RATIOS]
@@ -82,7 +80,7 @@ def write_summary(workspace: Workspace) -> Path:
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture of the page."""
+    """A figure of the page."""
 
     source: str  #: path, relative to the page
     text: str
@@ -127,7 +125,7 @@ def _gallery(workspace: Workspace, records: Sequence[RunRecord]) -> Figure | Non
 
 
 def _any_modality(workspace: Workspace) -> list[Figure]:
-    """The figures of notebook 11 in its last execution, each with the heading that it stands under."""
+    """The figures of the last executed copy of notebook 11, each with its heading."""
     name = "11_any_modality.ipynb"
     executed = [folder / name for folder in (workspace.reports / "notebooks", PACKAGE_PARENT / "notebooks")]
     found = next((path for path in executed if path.exists()), None)
@@ -159,8 +157,7 @@ def _save(figure: plt.Figure, folder: Path, name: str, text: str) -> Figure:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev summary`."""
-    parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
-    parser.add_argument("--scenes", default="", metavar="DIR", help="HM3DSem scenes instead of generated homes")
+    add_workspace_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> None:

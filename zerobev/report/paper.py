@@ -1,4 +1,4 @@
-"""Every published number that the workbook stands beside, and the claims made from them, as data.
+"""The published numbers of the paper, and its claims about them, as data.
 
 Monaci, Antsfeld, Chidlovskii, Wolf: Zero-BEV: Zero-shot Projection of Any First-Person Modality to BEV
 Maps, 3DV 2024. IoU in percent; classes in the order of `zerobev.config.LABELS`.
@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Row:
-    """One row of one of the paper's tables."""
+    """One row of a table of the paper."""
 
     table: int
-    row: str  #: the paper's letter; where it has none, that of the model and what is varied
+    row: str  #: the paper's letter; if it has none, the letter of the model and the varied setting
     method: str
     per_class: tuple[float, ...]  #: IoU of the eight classes
     class_iou: float  #: column "Avg."
@@ -74,7 +74,7 @@ TABLES: dict[int, dict[str, Row]] = {
     ),
 }
 
-#: parameters of each network, in millions (Table 1); of (d) without those of the depth estimator
+#: parameters of each network, in millions (Table 1); (d) without the depth estimator
 PARAMETERS_M = {"b.1": 15.0, "b.2": 41.0, "b.3": 41.0, "c": 41.0, "d": 41.0}
 
 #: errors of the fine-tuned depth estimator of (a.2) and (d): metres, and relative to the true depth (supplement)
@@ -83,7 +83,7 @@ DEPTH_ERRORS = {"mad_m": 0.13, "relative": 0.08}
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence of the paper about its numbers: the gain of one row over another, or the spread of several.
+    """A statement of the paper about its numbers.
 
     metric: "class" or "pixel" average, the name of a class, or "objects", the mean of the six object classes
     """
@@ -94,13 +94,13 @@ class Claim:
 
     @property
     def table(self) -> int:
-        """The table that the claim is about; its id begins with it."""
+        """Number of the table, with which the id begins."""
         return int(self.id.split(".")[0])
 
 
 @dataclass(frozen=True)
 class Ordering(Claim):
-    """`better` beats `worse`."""
+    """Row `better` beats row `worse`."""
 
     better: str
     worse: str
@@ -108,13 +108,13 @@ class Ordering(Claim):
 
 @dataclass(frozen=True)
 class Similar(Claim):
-    """The rows lie within `points` of each other: from the lowest to the highest."""
+    """The lowest and the highest row differ by less than `points`."""
 
     rows: tuple[str, ...]
     points: float  #: IoU points, twice the spread in the paper's own table
 
 
-#: What the paper says about its tables (its Section 4), in their order.
+#: Claims of the paper's Section 4, in the order of the tables.
 CLAIMS: tuple[Ordering | Similar, ...] = (
     Ordering("1.1", "class", "Zero-BEV beats the projection with estimated depth on class IoU", "c", "a.2"),
     Ordering("1.2", "pixel", "Zero-BEV beats the projection with estimated depth on pixel IoU", "c", "a.2"),
@@ -142,7 +142,7 @@ CLAIMS: tuple[Ordering | Similar, ...] = (
 
 @dataclass(frozen=True)
 class Ratio:
-    """A quotient of two rows of Table 1: it compares across data sets, which single numbers do not."""
+    """A quotient of two rows of Table 1, which is comparable across data sets."""
 
     numerator: str
     denominator: str

@@ -1,4 +1,4 @@
-"""Count the parameters of every network, block by block, beside the paper's.
+"""Count the parameters of each network, per block, and compare with the paper.
 
 Reads nothing; prints a table and writes the totals with `--json`.
 """
@@ -21,7 +21,7 @@ BLOCKS = (
 
 
 def parameters(network: nn.Module) -> dict[str, int]:
-    """Trainable parameters of each block of `network`, in the order of the pass, and their total."""
+    """Number of parameters per block of `network` (its direct children), and their total."""
     table = {name: sum(p.numel() for p in block.parameters()) for name, block in network.named_children()}
     return {**table, "total": sum(table.values())}
 
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the table; with `--json`, write the total of every row too."""
+    """Print the table; with `--json`, also write the total of each row."""
     chosen = scale(options.scale)
     with torch.device("meta"):  # shapes without memory
         tables = {row: parameters(build(row, chosen.camera, chosen.model)) for row in VARIANTS}

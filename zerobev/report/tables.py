@@ -1,4 +1,4 @@
-"""Records and the paper's numbers -> the tables that notebooks and the page of results share."""
+"""Tables of the notebooks and the page of results, from records and the paper's numbers."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from zerobev.report.claims import Verdict
 from zerobev.report.own_rows import OWN_ROWS
 from zerobev.report.paper import TABLES
 
-#: Where each table is shown; table 6 is not in the paper.
+#: Notebook of each table; table 6 is not in the paper.
 NOTEBOOKS = {
     1: "05_table1_zero_shot",
     2: "06_table2_model_variants",
@@ -22,15 +22,14 @@ NOTEBOOKS = {
     6: "09_table5_data_generation",
 }
 
-# claims are sentences: a table shows them whole
+# no truncated claims
 pd.set_option("display.max_colwidth", None)
 
 
 def table(number: int, records: Sequence[RunRecord]) -> pd.DataFrame:
-    """A table of the paper, its rows above ours, IoU in percent; ours are means over the records' seeds.
+    """A table of the paper with our rows below its rows, IoU in percent; ours are means over seeds.
 
-    Rows of `report.own_rows` follow. Rows without a record are shown with the paper's numbers alone, so that missing
-    ones are seen.
+    Rows of `report.own_rows` follow. A row of the paper without a record has only the paper's numbers.
     """
     lines = []
     for letter, method in rows_of(number).items():
@@ -46,13 +45,13 @@ def table(number: int, records: Sequence[RunRecord]) -> pd.DataFrame:
 
 
 def rows_of(number: int) -> dict[str, str]:
-    """Row -> method of a table: the paper's rows, then those of `zerobev.report.own_rows`."""
+    """Row -> method of a table: the paper's rows, then rows of `zerobev.report.own_rows`."""
     published = {letter: row.method for letter, row in TABLES.get(number, {}).items()}
     return published | OWN_ROWS.get(number, {})
 
 
 def cost_table(records: Sequence[RunRecord]) -> pd.DataFrame:
-    """Where numbers come from: seed, device, steps and seconds of each run, from its record."""
+    """Seed, device, steps, cost and revision of each run, from its record."""
     columns = ["row", "seed", "device", "steps", "train [s]", "evaluate [s]", "memory [MB]", "test homes", "revision"]
     lines = [
         (
@@ -66,13 +65,13 @@ def cost_table(records: Sequence[RunRecord]) -> pd.DataFrame:
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
-    """Claims and verdicts for a notebook, differences in IoU points."""
+    """Claims and verdicts for a notebook; differences in IoU points."""
     frame = pd.DataFrame([vars(verdict) for verdict in verdicts]).set_index("id").drop(columns="table")
     return frame.astype({"paper": float, "ours": float, "low": float, "high": float})
 
 
 def scoreboard(verdicts: Sequence[Verdict]) -> Markdown:
-    """Every claim with its verdict and a link to the notebook that shows it; differences in IoU points."""
+    """All claims with verdicts and links to their notebooks; differences in IoU points."""
     lines = ["| | claim | paper | ours | 90 % interval | verdict | |", "|---|---|---|---|---|---|---|"]
     for v in verdicts:
         paper, ours = ("" if value is None else f"{value:+.1f}" for value in (v.paper, v.ours))
@@ -83,20 +82,20 @@ def scoreboard(verdicts: Sequence[Verdict]) -> Markdown:
 
 
 class Checks:
-    """What a notebook checked, claim by claim, for its closing table."""
+    """The checks of a notebook, for its closing table."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[str, str, str]] = []
 
     def holds(self, claim: str, expected: str, condition: bool) -> None:
-        """Assert `condition`, which must hold on any machine, and note that it does."""
+        """Assert `condition`, which must hold on any machine, and note it."""
         assert condition, f"{claim}: expected {expected}"
         self._rows.append((claim, expected, "holds"))
 
     def note(self, claim: str, expected: str, verdict: str) -> None:
-        """Note the verdict on a claim that may turn out either way."""
+        """Note the verdict on a claim that may or may not hold."""
         self._rows.append((claim, expected, verdict))
 
     def table(self) -> pd.DataFrame:
-        """Claim, what was expected, and the verdict."""
+        """Claim, expectation and verdict of each check."""
         return pd.DataFrame(self._rows, columns=["claim", "expected", "verdict"]).set_index("claim")

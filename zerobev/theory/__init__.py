@@ -1,1 +1,1 @@
-"""Theorem 3.1 of the paper in numbers: correspondence, the two-stream attention alone, and max-pooling."""
+"""Theorem 3.1 of the paper in numbers: correspondence, two-stream attention without a network, max-pooling."""

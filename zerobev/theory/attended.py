@@ -1,7 +1,7 @@
-"""Where the attention of a trained network looks, held against gamma (paper, Section 3.3 and Theorem 3.1).
+"""The attention of a trained network against gamma (paper, Section 3.3 and Theorem 3.1).
 
-For a map cell that the camera sees, the right place is known: the pixels of its column whose point falls into it. For a
-cell that is hidden there is no such pixel; what a network can know of it, it knows from the rest of the column.
+The correct attention of a visible map cell is known: the pixels of its image column whose points lie in the cell. A
+hidden cell has no such pixel; the network can infer it only from the rest of the column.
 """
 
 from collections.abc import Iterator
@@ -18,16 +18,16 @@ from zerobev.theory.correspondence import positions
 
 @torch.no_grad()
 def attended(net: ZeroBEV, rgb: Tensor, zero: Tensor, depth: Tensor, floor: Tensor) -> pd.DataFrame:
-    """Share of the attention of the last layer that lies on the true pixels, and of hidden cells on the floor.
+    """Fraction of the last layer's attention on the true pixels; for hidden cells, on floor pixels.
 
-    Cells that are seen are told apart: some show floor alone, on others something is raised. Hidden are positions that
-    no pixel of the column falls into although one falls beyond them, as far as the floor there would be in the image.
-    A feature counts as true if one of the pixels under it is.
+    Three kinds of cells: "floor" cells show only floor, "raised" cells also an object. "hidden" cells contain no pixel
+    of their column, some pixel of the column lies farther away, and floor at their distance would be inside the image.
+    A feature counts as true if one of its pixels does.
 
-    rgb: (B, 3, H, W); zero: (B, 1, H, W) zero-shot images, which the attention sees, too
-    depth: (B, H, W) true planar depth, metres; floor: (B, H, W) bool, pixels that show floor
-    Returns one line a band (0 is nearest), head and kind of cell: `share`, its mean over cells, `uniform`, that of an
-    attention that looks everywhere alike, and the number of `cells`.
+    rgb: (B, 3, H, W); zero: (B, 1, H, W) zero-shot images, another input of the attention
+    depth: (B, H, W) true planar depth, metres; floor: (B, H, W) bool, floor pixels
+    Returns one line per band (0 is nearest), head and kind of cell: the mean fraction over cells (column `share`), the
+    fraction of a uniform attention (`uniform`), and the number of `cells`.
     """
     camera, position = net.camera, positions(depth, net.camera)
     nearest_m = 2 * camera.height_m * camera.focal_px / camera.fpv_px  # floor at the lower edge of the image
@@ -44,17 +44,18 @@ def attended(net: ZeroBEV, rgb: Tensor, zero: Tensor, depth: Tensor, floor: Tens
         kinds = {"floor": (true.any(-1) & ~raised, true), "raised": (raised, true), "hidden": (hidden, on_floor)}
         for head, weights in enumerate(cross.unbind(2)):
             for kind, (cells, target) in kinds.items():
-                share, uniform = (float((w * target).sum(-1)[cells].mean()) for w in (weights, 1 / target.shape[-1]))
-                lines.append((band, head, kind, share, uniform, int(cells.sum())))
+                fractions = (float((w * target).sum(-1)[cells].mean()) for w in (weights, 1 / target.shape[-1]))
+                lines.append((band, head, kind, *fractions, int(cells.sum())))
     columns = ["band", "head", "cells are", "share", "uniform", "cells"]
     return pd.DataFrame(lines, columns=columns).set_index(columns[:3])
 
 
 @torch.no_grad()
 def column_attention(net: ZeroBEV, rgb: Tensor, zero: Tensor, column: int) -> Tensor:
-    """Where the ray of one image column looks: (heads, M, H), map rows over image rows; sums to 1 over H.
+    """Attention of the ray of one image column: (heads, M, H), map rows over image rows; sums to 1 over H.
 
-    rgb: (1, 3, H, W); zero: (1, 1, H, W); column: of the image, in pixels. The pixels under a feature share its weight.
+    rgb: (1, 3, H, W); zero: (1, 1, H, W); column: image column, pixels. The pixels of a feature have equal parts of its
+    weight.
     """
     bands = [
         cross[0, column // stride].repeat_interleave(stride, -1)[..., : rgb.shape[-2]] / stride
@@ -64,7 +65,7 @@ def column_attention(net: ZeroBEV, rgb: Tensor, zero: Tensor, column: int) -> Te
 
 
 def _bands(net: ZeroBEV, rgb: Tensor, zero: Tensor) -> Iterator[tuple[Tensor, range, int]]:
-    """Cross-attention (B, C, heads, P, R) of each band, near band first, its map rows, and its stride."""
+    """Cross-attention (B, C, heads, P, R), map rows and stride of each band, near band first."""
     rows = band_rows(net.camera, net.config.band_edges_m)
     for number, band in enumerate(net.attention(rgb, zero)):
         stride = net.config.stem_stride * 2 ** (len(rows) - 1 - number)
@@ -72,5 +73,5 @@ def _bands(net: ZeroBEV, rgb: Tensor, zero: Tensor) -> Iterator[tuple[Tensor, ra
 
 
 def _under_features(pixels: Tensor, stride: int) -> Tensor:
-    """(B, P, H, W) bool -> (B, C, P, R): whether one of the pixels under a feature is set."""
+    """(B, P, H, W) bool -> (B, C, P, R): whether any pixel of a feature is set."""
     return F.max_pool2d(pixels.float(), stride, ceil_mode=True).bool().permute(0, 3, 1, 2)

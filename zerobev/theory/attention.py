@@ -1,4 +1,4 @@
-"""The two-stream network of the paper's Eqs. 7 and 8, cross-attention alone, and its training on the aux stream."""
+"""The two-stream cross-attention of the paper's Eqs. 7 and 8 without a network, and its training on the aux stream."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,32 +9,26 @@ from torch import Tensor, nn
 
 from zerobev.theory.correspondence import Columns, uniform_attention
 
-#: How many columns the divergence is measured on during training, and how often.
-_MEASURED, _EVERY = 256, 10
+_WIDTH = 64  # of queries and keys
+_MEASURED = 256  # columns on which a training measures the divergence
+_EVERY = 10  # steps between two measurements
 
 Stream = Callable[[Tensor, Tensor], Tensor]
 
 
 class CrossAttention(nn.Module):
-    """One layer with one head (paper, Eqs. 3 and 4), its attention shared by two streams of values (Eqs. 7 and 8).
+    """One layer with one head (paper, Eqs. 3 and 4); two streams of values share its attention (Eqs. 7 and 8).
 
-    A query is a trained vector for each position, which stands for W_Q on a positional encoding. There is nothing else:
-    no backbone, no feed-forward layer, no normalisation.
+    Each position has a trained query, in place of W_Q on a positional encoding. No backbone, feed-forward layer or
+    normalisation.
 
-    value: (A, A') channels of the aux stream's trained value projection; None: it is the identity, too
+    value: (A, A') channels of the aux stream's trained value projection; None: identity
     """
 
-    def __init__(
-        self,
-        positions: int,
-        features: int,
-        rng: np.random.Generator,
-        width: int = 64,
-        value: tuple[int, int] | None = None,
-    ):
+    def __init__(self, positions: int, features: int, rng: np.random.Generator, value: tuple[int, int] | None = None):
         super().__init__()
-        self.queries = _normal((positions, width), 1.0, rng)  # p W_Q
-        self.keys = _normal((features, width), features**-0.5, rng)  # W_K
+        self.queries = _normal((positions, _WIDTH), 1.0, rng)  # p W_Q
+        self.keys = _normal((features, _WIDTH), features**-0.5, rng)  # W_K
         self.value = None if value is None else _normal(value, value[0] ** -0.5, rng)  # W_V
 
     def logits(self, features: Tensor) -> Tensor:
@@ -50,16 +44,16 @@ class CrossAttention(nn.Module):
         return self.attention(features) @ (values if self.value is None else values @ self.value)
 
     def zero(self, features: Tensor, values: Tensor) -> Tensor:
-        """Eq. 8: values (N, R, K) of any modalities, as they are -> rays (N, P, K)."""
+        """Eq. 8: values (N, R, K) of any modalities -> rays (N, P, K)."""
         return self.attention(features) @ values
 
 
 class Progress(NamedTuple):
-    """A training, seen every ten steps."""
+    """Curves of a training, one point every ten steps."""
 
     step: list[int]
     loss: list[float]
-    divergence: list[float]  #: from gamma, as `divergence` measures it
+    divergence: list[float]  #: from gamma, see `divergence`
 
 
 def train(
@@ -73,7 +67,7 @@ def train(
     batch: int = 96,
     learning_rate: float = 0.03,
 ) -> Progress:
-    """Minimise the squared error of one stream where some pixel falls; the network is changed in place.
+    """Minimise the squared error of one stream at positions with pixels; changes the network in place.
 
     stream: `net.aux`, or another function of features (n, R, F) and values (n, R, A) that uses the network
     values: (N, R, A) of the image columns; target: (N, P, A') of their rays
@@ -82,9 +76,9 @@ def train(
     decay = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: 1 - step / steps)
     progress = Progress([], [], [])
     for step in range(steps + 1):
-        some = torch.from_numpy(rng.integers(len(values), size=batch))
-        error = stream(columns.features[some], values[some]) - target[some]
-        loss = error[columns.gamma[some].any(-1)].square().mean()
+        drawn = torch.from_numpy(rng.integers(len(values), size=batch))
+        error = stream(columns.features[drawn], values[drawn]) - target[drawn]
+        loss = error[columns.gamma[drawn].any(-1)].square().mean()
         if step % _EVERY == 0:
             progress.step.append(step)
             progress.loss.append(float(loss.detach()))
@@ -99,21 +93,24 @@ def train(
 
 @torch.no_grad()
 def divergence(net: CrossAttention, columns: Columns) -> float:
-    """Total variation between the attention and gamma's, in [0, 1], averaged over positions that some pixel falls into.
-
-    For values in [0, 1] no modality can be wrong by more than that at a position, and one modality is.
-    """
+    """Mean `total_variation` over positions with pixels, in [0, 1]."""
     return float(total_variation(net.attention(columns.features), columns.gamma)[columns.gamma.any(-1)].mean())
 
 
 def total_variation(attention: Tensor, gamma: Tensor) -> Tensor:
-    """Half the summed difference of attention (..., P, R) and gamma's uniform one -> (..., P) in [0, 1]."""
+    """Half the L1 distance of attention (..., P, R) and gamma's uniform attention -> (..., P) in [0, 1].
+
+    For values in [0, 1] it is the largest error that any modality can have at a position.
+    """
     return (attention - uniform_attention(gamma)).abs().sum(-1) / 2
 
 
 @torch.no_grad()
 def zero_shot_error(net: CrossAttention, columns: Columns, values: Tensor, target: Tensor) -> float:
-    """Root mean squared error of the zero-shot stream where some pixel falls: values (N, R, K), target (N, P, K)."""
+    """Root mean squared error of the zero-shot stream at positions with pixels.
+
+    values: (N, R, K); target: (N, P, K)
+    """
     error = net.zero(columns.features, values) - target
     return float(error[columns.gamma.any(-1)].square().mean().sqrt())
 

@@ -1,8 +1,8 @@
-"""How well can anything linear max-pool (paper, supplement, "Non-linear pooling to the ground")?
+"""The error of linear operators that imitate max-pooling (paper, supplement, "Non-linear pooling to the ground").
 
-An attention that does not see the values is linear in them, whatever its queries, keys and heads. A cell is the maximum
-of `inside` pixels; `outside` more pixels are in the column. Values are binary, independent of each other and of
-geometry, and white with probability `white`: then all errors are known in closed form.
+An attention computed without the values is linear in them. A cell is the maximum of `inside` pixels; its column has
+`outside` other pixels. Values are binary, independent of each other and of geometry, and white with probability
+`white`: all errors have closed forms.
 
 With q = 1 - white, the maximum t of N pixels has E t = 1 - q^N; t h_y = h_y for a pixel inside, while a pixel outside
 is independent of t.
@@ -14,9 +14,9 @@ from torch import Tensor
 
 
 def expected_error(weights: Tensor, gamma: Tensor, white: float) -> Tensor:
-    """Mean squared error of sum_y w_y h_y as the maximum over gamma, exact and not sampled.
+    """Expected squared error of sum_y w_y h_y against the maximum over gamma, in closed form.
 
-    weights: (..., R), attention for example; gamma: (..., R) bool. Returns (...) of the dtype of `weights`.
+    weights: (..., R), for example attention; gamma: (..., R) bool. Returns (...) of the dtype of `weights`.
     """
     mean = 1 - (1 - white) ** gamma.sum(-1).to(weights.dtype)
     together = white * (weights * gamma).sum(-1) + white * mean * (weights * ~gamma).sum(-1)  # E t (w h)
@@ -25,41 +25,41 @@ def expected_error(weights: Tensor, gamma: Tensor, white: float) -> Tensor:
 
 
 def best_linear(inside: int, outside: int, white: float) -> tuple[np.ndarray, float]:
-    """The weights (inside + outside,) of the least error among all linear operators, and that error.
+    """The weights (inside + outside,) of the linear operator with the smallest error, and this error.
 
-    By symmetry the weights inside are equal, and those outside: 2 x 2 normal equations. Pixels outside have a weight,
-    too, since their average stands in for a constant.
+    By symmetry all weights inside are equal, and all weights outside: 2 x 2 normal equations. Pixels outside have a
+    weight because their average replaces a constant term.
     """
     count = np.array([inside, outside], float)
     mean = 1 - (1 - white) ** inside
     normal = white * (1 - white) * np.diag(count) + white**2 * np.outer(count, count)
-    share = np.linalg.lstsq(normal, white * count * [1.0, mean], rcond=None)[0]
-    weights = np.repeat(share, [inside, outside])
+    solution = np.linalg.lstsq(normal, white * count * [1.0, mean], rcond=None)[0]
+    weights = np.repeat(solution, [inside, outside])
     return weights, _error(weights, inside, white)
 
 
 def best_attention(inside: int, outside: int, white: float) -> tuple[np.ndarray, float]:
-    """The same among the weights that an attention can have with identity values: not negative, with sum 1."""
+    """As `best_linear`, for the weights of an attention with identity values: non-negative, with sum 1."""
     if not outside:
         weights = np.full(inside, 1 / inside)
     else:
-        # the error is a parabola of the share that stays inside, with its vertex here
-        share = ((1 - white) ** (inside - 1) + 1 / outside) / (1 / inside + 1 / outside)
-        share = min(share, 1.0)
-        weights = np.repeat([share / inside, (1 - share) / outside], [inside, outside])
+        # the vertex of the error, a parabola in the sum of the weights inside
+        fraction = ((1 - white) ** (inside - 1) + 1 / outside) / (1 / inside + 1 / outside)
+        fraction = min(fraction, 1.0)
+        weights = np.repeat([fraction / inside, (1 - fraction) / outside], [inside, outside])
     return weights, _error(weights, inside, white)
 
 
 def worst_case(inside: int) -> float:
-    """The least error that a linear operator can have on its worst binary values: (N - 1) / (N + 1).
+    """The smallest maximum error of a linear operator over all binary values: (N - 1) / (N + 1).
 
-    One white pixel leaves 1 - w_y, all white leave |sum w - 1|; equal weights of 2 / (N + 1) balance the two.
+    One white pixel has the error 1 - w_y, all white pixels |sum w - 1|; equal weights 2 / (N + 1) balance the two.
     """
     return (inside - 1) / (inside + 1)
 
 
 def worst_case_attention(inside: int) -> float:
-    """The same with weights that sum to 1: one white pixel is shown as 1 / N, so that 1 - 1 / N is missing."""
+    """As `worst_case`, with weights that sum to 1: one white pixel gives 1 / N, an error of 1 - 1 / N."""
     return 1 - 1 / inside
 
 

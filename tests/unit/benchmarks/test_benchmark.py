@@ -1,4 +1,4 @@
-"""What the benchmark counts, against closed forms; that it takes time is not a matter of tests."""
+"""Counts of the benchmark against closed forms."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from torch import nn
 from zerobev.benchmarks import run as benchmark
 from zerobev.benchmarks import training
 from zerobev.benchmarks.run import ROWS, measure_inference
-from zerobev.benchmarks.training import Machine, blocks, flops, min_milliseconds, training_step, waiting_share
+from zerobev.benchmarks.training import Machine, blocks, flops, min_milliseconds, training_step, waiting_fraction
 from zerobev.config import SCALES
 from zerobev.models import build
 
@@ -25,7 +25,7 @@ def test_operations_of_products_and_convolutions_in_closed_form():
     layer, image = nn.Conv2d(4, 6, 3, padding=1), torch.rand(2, 4, 8, 8)
     forward = 2 * (2 * 8 * 8) * (4 * 9) * 6
     assert flops(lambda: layer(image)) == forward
-    # the gradient of the weights costs as much again; that of the image is not asked for
+    # the gradient of the weights costs the same; the image needs no gradient
     assert flops(lambda: layer(image).sum().backward()) == 2 * forward
 
 
@@ -38,17 +38,17 @@ def test_blocks_are_all_of_a_step():
 
 
 def test_a_roofline_in_closed_form():
-    """At 1 GFLOP and 1 MB a millisecond: 1 TFLOP/s and 1 GB/s."""
+    """At 1 GFLOP and 1 MB per millisecond: 1 TFLOP/s and 1 GB/s."""
     a, b = torch.rand(2, 1000, 250)
-    assert min_milliseconds(lambda: a + b, 1, 1) == pytest.approx(3)  # two read, one written, a megabyte each
-    assert min_milliseconds(lambda: a.add_(b), 1, 1) == pytest.approx(2)  # at least
+    assert min_milliseconds(lambda: a + b, 1, 1) == pytest.approx(3)  # two read, one written, one megabyte each
+    assert min_milliseconds(lambda: a.add_(b), 1, 1) == pytest.approx(2)
     assert min_milliseconds(lambda: a + b[:1], 1, 1) == pytest.approx(2.001)
     assert min_milliseconds(lambda: a.T.unsqueeze(0).detach().view(1, 250, 1000), 1, 1) == 0
     assert min_milliseconds(lambda: torch.empty_like(a), 1, 1) == 0
     product = 2 * 1000 * 250 * 1000 / 1e9  # milliseconds; in memory it takes 2 for the factors, 4 for the result
     assert min_milliseconds(lambda: a @ b.T, 1, 1) == pytest.approx(6)
     assert min_milliseconds(lambda: a @ b.T, 0.01, 1) == pytest.approx(100 * product)
-    assert min_milliseconds(lambda: a + a @ b.T @ a, 0.01, 1) == pytest.approx(200 * product + 3)  # one by one
+    assert min_milliseconds(lambda: a + a @ b.T @ a, 0.01, 1) == pytest.approx(200 * product + 3)
 
 
 def test_a_roofline_of_products_alone_is_their_number():
@@ -63,7 +63,7 @@ def test_waiting_is_the_time_between_steps(monkeypatch):
     clock = [0.0]
 
     class Slow:
-        def batch(self, step, rank=0, ranks=1):
+        def batch(self, step, rank=0, world_size=1):
             clock[0] += 3
             return Machine().batch(SMOKE.camera, 2)
 
@@ -75,7 +75,7 @@ def test_waiting_is_the_time_between_steps(monkeypatch):
 
     monkeypatch.setattr(training.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(training, "training_step", counted)
-    assert waiting_share(None, Slow(), Machine(), workers=0) == {"share": 3 / 8, "milliseconds": 8000}
+    assert waiting_fraction(None, Slow(), Machine(), workers=0) == {"share": 3 / 8, "milliseconds": 8000}
 
 
 def test_runs_take_turns_and_the_first_turn_does_not_count(monkeypatch):
@@ -83,12 +83,12 @@ def test_runs_take_turns_and_the_first_turn_does_not_count(monkeypatch):
     monkeypatch.setattr(training.time, "perf_counter", lambda: next(clock) ** 2)
     found = Machine().milliseconds({name: lambda name=name: calls.append(name) for name in "ab"}, repeats=2)
     assert calls == list("ababab")
-    # the clock is read twice to warm up, then from 2^2 to 3^2 for a, from 4^2 to 5^2 for b, and so on
+    # the warm-up reads the clock twice; then a takes 3^2 - 2^2, b 5^2 - 4^2, and so on
     assert found["a"] == {"median": 9e3, "low": 5e3, "high": 13e3}
     assert found["b"] == {"median": 13e3, "low": 9e3, "high": 17e3}
 
 
-def test_one_call_and_separate_calls_see_the_same_images(monkeypatch):
+def test_one_call_and_separate_calls_get_the_same_images(monkeypatch):
     seen = {"shared": [], "separate": []}
 
     def listen(row, camera, model):

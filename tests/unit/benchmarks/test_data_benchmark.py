@@ -1,4 +1,4 @@
-"""The benchmark compares what is the same: pairs that are rendered anew are those that are looked up."""
+"""Rendered pairs equal looked-up pairs, and figures of the benchmark follow from its measurements."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ POSES = (Pose(2.0, 0.5, 0, 1.0), Pose(4.4, 2.4, 0, -2.9), Pose(0.6, 3.5, 0, -0.7
 
 @pytest.fixture(scope="module")
 def setting() -> Scale:
-    """The smoke scale, with large squares for structures."""
+    """The smoke scale with another camera."""
     return replace(scale("smoke"), camera=CAMERA)
 
 
@@ -33,7 +33,7 @@ def scene() -> Scene:
     return build(furnished())
 
 
-def test_a_pair_rendered_anew_is_the_pair_looked_up(scene, setting):
+def test_a_rendered_pair_is_the_looked_up_pair(scene, setting):
     bank, caster, rerenderer = noise_bank(setting, 0.2), RayCaster(scene), Rerenderer(scene, CAMERA)
     agree = {"fpv": [], "bev": [], "another": []}
     for seed, pose in enumerate(POSES):
@@ -45,7 +45,7 @@ def test_a_pair_rendered_anew_is_the_pair_looked_up(scene, setting):
         agree["bev"].append((rerenderer.bev(pose) == bank.look_up(caster.bev(pose, CAMERA).texel, draw)).mean())
         rerenderer.wear(texture_images(scene, bank, np.random.default_rng(seed + 10)))
         agree["another"].append((rerenderer.fpv(pose)[0] == looked_up).mean())
-    assert np.mean(agree["fpv"]) > 0.97 and np.mean(agree["bev"]) > 0.97  # all but the edges of squares
+    assert np.mean(agree["fpv"]) > 0.97 and np.mean(agree["bev"]) > 0.97  # except edges of squares
     assert np.mean(agree["another"]) < 0.85
 
 
@@ -54,21 +54,21 @@ def test_rendered_depth_is_the_cast_one(scene):
     rerenderer.wear([np.zeros(image.shape, bool) for image in scene.chart_instance])
     for pose in POSES:
         cast = RayCaster(scene).fpv(pose, CAMERA).distance
-        # a sample of the rasteriser lies up to half a pixel beside the ray
+        # samples of the rasteriser and rays differ by up to half a pixel
         near = [filter_(cast, size=3) for filter_ in (ndimage.minimum_filter, ndimage.maximum_filter)]
         depth = rerenderer.fpv(pose)[1]
         between = (depth > 0.99 * near[0]) & (depth < 1.01 * near[1])
         assert between[1:-1, 1:-1].mean() > 0.995
 
 
-def test_share_of_a_noise_bank(setting):
-    for share in benchmark.DENSITIES:
-        assert noise_bank(setting, share).tiles.mean() == pytest.approx(share, abs=0.01)
+def test_white_fraction_of_a_noise_bank(setting):
+    for white in benchmark.DENSITIES:
+        assert noise_bank(setting, white).tiles.mean() == pytest.approx(white, abs=0.01)
 
 
 @pytest.fixture
 def measured(scene, setting, monkeypatch) -> dict:
-    """The measurements of a hand-made home, in the shortest time, as JSON gives them back."""
+    """The measurements of a hand-made home, after a round trip through JSON."""
 
     def folder(root, number):
         write_scene(root / f"{number:05d}-Home", scene)
@@ -81,7 +81,7 @@ def measured(scene, setting, monkeypatch) -> dict:
     return json.loads(json.dumps(found)) | {"printed": "\n".join(benchmark.table(found))}
 
 
-def test_figures_follow_from_what_was_measured(measured):
+def test_figures_follow_from_the_measurements(measured):
     views, pairs = measured["by_workers"]["1"], measured["by_kind"]
     assert measured["views_per_s"] == views["median"] > 0
     assert measured["pairs_per_s"] == pairs["looked_up"]["synth 0.2"]["median"] > 0

@@ -1,4 +1,4 @@
-"""The plan of a reproduction: its arithmetic, what it measures, and the paper's scale once through in small numbers."""
+"""The forecast of a reproduction: arithmetic, measurements; and the paper's scale end to end in small numbers."""
 
 import subprocess
 from dataclasses import replace
@@ -41,7 +41,7 @@ FORECAST = Forecast(
 )
 
 
-def test_arithmetic_of_a_plan_by_hand():
+def test_arithmetic_of_a_forecast_by_hand():
     assert FORECAST.views == 362_000
     assert FORECAST.disk_bytes == {
         "views": 217.2e9,
@@ -49,7 +49,7 @@ def test_arithmetic_of_a_plan_by_hand():
         "weights": (24 * 2 + 4) * 200e6,
     }
     assert FORECAST.needed_bytes["free disk"] == pytest.approx(217.2e9 + 106.758144e9 + 10.4e9 - 100e9)
-    # 32 photographs of the estimator take more than 16 samples of (c): 1 + 5 x 0.1 + 32 x 0.3 against 1 + 1 + 8 GB
+    # 32 samples of the estimator take more than 16 of (c): 1 + 5 x 0.1 + 32 x 0.3 against 1 + 1 + 8 GB
     assert FORECAST.needed_bytes["memory"] == pytest.approx(11.1e9)
     assert replace(FORECAST, estimator=FORECAST.network).needed_bytes["memory"] == pytest.approx(18e9)
     assert FORECAST.hours(workers=2) == pytest.approx(
@@ -63,7 +63,7 @@ def test_arithmetic_of_a_plan_by_hand():
     assert replace(FORECAST, there_bytes=10**12).needed_bytes["free disk"] == 0
 
 
-def test_what_does_not_fit_is_refused_in_one_line():
+def test_too_little_disk_or_memory_is_refused_in_one_line():
     there = {"free disk": 235e9, "memory": 12e9}
     FORECAST.check(there)
     with pytest.raises(InputError, match=r"^scale paper: expected 234\.4 GB of free disk, found 200\.0 GB$"):
@@ -74,19 +74,19 @@ def test_what_does_not_fit_is_refused_in_one_line():
     assert len(table.splitlines()) == 10 and "362,000" in table and "234.4 GB of free disk, of 235.0 GB" in table
 
 
-def test_what_a_network_keeps_by_hand():
-    """Its input, and the output of the first layer once, although two layers keep it; not the weights."""
+def test_saved_bytes_by_hand():
+    """The input, and the output of the first layer once, although two layers save it; not the weights."""
     net = nn.Sequential(nn.Linear(4, 8, bias=False), nn.ReLU(), nn.Linear(8, 2, bias=False))
     images = torch.rand(5, 4)
     assert saved_bytes(lambda: net(images).sum(), net) == 4 * (5 * 4 + 5 * 8)
 
 
-def test_a_plan_foretells_the_views_and_sees_what_is_done(tmp_path, monkeypatch):
+def test_a_forecast_measures_views_and_counts_existing_ones(tmp_path, monkeypatch):
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(forecasting, "_SECONDS", 0.1)
     workspace = Workspace("tiny", root=tmp_path)
     before = forecast(workspace)
-    assert not list(tmp_path.iterdir())  # it leaves nothing behind
+    assert not list(tmp_path.iterdir())  # it writes nothing
     assert before.homes == {"train": 1, "validation": 1, "test": 1} and before.there_bytes == 0
     assert before.left == {"homes": 3, "networks": before.networks, "estimators": 1}
     assert before.networks == sum(experiment.network is not None for experiment in EXPERIMENTS.values())
@@ -103,7 +103,7 @@ def test_a_plan_foretells_the_views_and_sees_what_is_done(tmp_path, monkeypatch)
     assert before.network.weight_bytes == 4 * weights
 
 
-def test_the_command_prints_the_plan_and_refuses(monkeypatch, capsys):
+def test_the_command_prints_the_forecast_and_refuses(monkeypatch, capsys):
     monkeypatch.setattr(forecasting, "forecast", lambda workspace: FORECAST)
     monkeypatch.setattr(forecasting.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e9))
     with pytest.raises(SystemExit, match=r"^error: scale paper: expected 234\.4 GB of free disk, found 1\.0 GB$"):
@@ -121,7 +121,7 @@ def test_the_command_prints_the_plan_and_refuses(monkeypatch, capsys):
         (["SCALE=paper", "REFUSED=1"], ["plan"]),
     ],
 )
-def test_make_plans_the_papers_scale_first(arguments, called, tmp_path):
+def test_make_forecasts_the_papers_scale_first(arguments, called, tmp_path):
     python = tmp_path / "python"
     python.write_text('#!/bin/sh\necho "$2 $3"\n[ -z "$REFUSED" ] || exit 1\n')
     python.chmod(0o755)
@@ -132,9 +132,9 @@ def test_make_plans_the_papers_scale_first(arguments, called, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_papers_scale_once_through(tmp_path, monkeypatch):
+def test_the_papers_scale_end_to_end(tmp_path, monkeypatch):
     """From homes to a record at the paper's sizes and with its network; four homes, two views of each, three steps."""
-    ResNetModel(ResNetConfig()).save_pretrained(tmp_path / "resnet-50")  # of the paper's shape, with random weights
+    ResNetModel(ResNetConfig()).save_pretrained(tmp_path / "resnet-50")  # a ResNet-50 with random weights
     paper = SCALES["paper"]
     few = replace(
         paper,

@@ -1,4 +1,4 @@
-"""The measure of decorrelation: closed forms, chance that is chance, and dependence that is found."""
+"""Decorrelation: closed forms, uniform p-values without dependence, and planted dependence that is found."""
 
 import numpy as np
 import pytest
@@ -32,18 +32,18 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(3)
 
 
-def entropy(share: float) -> float:
-    return -share * np.log2(share) - (1 - share) * np.log2(1 - share)
+def entropy(fraction: float) -> float:
+    return -fraction * np.log2(fraction) - (1 - fraction) * np.log2(1 - fraction)
 
 
 def blobs(count: int, rng: np.random.Generator, sigma: float = 2.0) -> np.ndarray:
-    """(count, SIDE, SIDE) bool: smooth random textures, half white; cells of one are far from independent."""
+    """(count, SIDE, SIDE) bool: smooth random textures, half white; the cells of one are dependent."""
     noise = rng.standard_normal((count, SIDE, SIDE))
     return ndimage.gaussian_filter(noise, (0, sigma, sigma), mode="wrap") > 0
 
 
 def furniture(count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, SIDE, SIDE) int in 0..3: large regions, as of classes."""
+    """(count, SIDE, SIDE) int in 0..3: large regions, like classes."""
     return 2 * blobs(count, rng).astype(int) + blobs(count, rng)
 
 
@@ -56,11 +56,11 @@ def test_information_of_a_noisy_channel(error):
     assert mutual_information(table) == pytest.approx(1 - entropy(error), abs=1e-6)
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
-def test_a_map_that_is_its_descriptor_tells_all(share):
-    white = round(share * 1000)
+@pytest.mark.parametrize("fraction", [0.05, 0.2, 0.5])
+def test_information_of_a_map_that_follows_from_its_descriptor(fraction):
+    white = round(fraction * 1000)
     table = np.array([[1000 - white, 0], [0, white - 10], [0, 10], [0, 0]])
-    assert mutual_information(table) == pytest.approx(entropy(share))
+    assert mutual_information(table) == pytest.approx(entropy(fraction))
     assert prediction_auc(table, table) == 1
 
 
@@ -74,7 +74,7 @@ def test_information_is_entropy_minus_conditional_entropy(table):
 
 
 @given(tables)
-def test_a_coarser_descriptor_never_tells_more(table):
+def test_a_coarser_descriptor_has_no_more_information(table):
     coarser = np.concatenate([table[:1] + table[-1:], table[1:-1]])
     assert mutual_information(coarser) <= mutual_information(table) + 1e-9
 
@@ -97,7 +97,7 @@ def test_auc_is_the_chance_to_rank_a_pair_rightly(fitted, data):
         assert np.isnan(auc)
 
 
-def test_values_that_were_never_seen_are_a_guess():
+def test_values_without_fitted_cells_have_an_auc_of_one_half():
     fitted = np.array([[50, 50], [0, 0], [0, 0]])
     assert prediction_auc(fitted, np.array([[0, 0], [3, 9], [5, 1]])) == 0.5
 
@@ -110,11 +110,11 @@ def test_contingency_counts_valid_cells(rng):
             assert table[value, white] == (valid & (descriptor == value) & (maps == white)).sum()
 
 
-# the test against chance
+# null distribution
 
 
 def p_values(scenes: int, views: int, grouped: bool, draws: int = 39) -> np.ndarray:
-    """(60, 2) p-values of both numbers for textures that know nothing of the furniture, kept in a scene."""
+    """(60, 2) p-values of both numbers for textures independent of the furniture, both fixed per scene."""
     found = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -133,19 +133,19 @@ def is_uniform(p: np.ndarray, draws: int = 39) -> bool:
 
 
 @pytest.mark.parametrize("scenes,views", [(24, 1), (12, 4)])
-def test_chance_is_chance(scenes, views):
-    """p-values are uniform for independent textures, though cells, and the views of a scene, are not independent."""
+def test_p_values_of_independent_textures_are_uniform(scenes, views):
+    """Although neither the cells of a view nor the views of a scene are independent."""
     for p in p_values(scenes, views, grouped=True).T:
         assert is_uniform(p)
 
 
 def test_views_that_share_a_texture_are_no_independent_samples():
-    """The reason for groups: taken for independent views, one texture a scene looks like a dependence."""
+    """The reason for groups: with one texture per scene, views taken as independent show a false dependence."""
     assert not is_uniform(p_values(12, 6, grouped=False)[:, 0])
 
 
-def test_textures_that_end_where_objects_end_tell_nothing_of_them():
-    """Charts of an atlas do end there: a class is then of one texture in a view, of another in the next view."""
+def test_textures_that_end_at_the_edges_of_objects_are_no_dependence():
+    """As charts of an atlas do: a class then has one texture per view."""
     bits, auc = [], []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -161,7 +161,7 @@ def test_textures_that_end_where_objects_end_tell_nothing_of_them():
 
 
 def planted(error: float, rng: np.random.Generator, draws: int = 99) -> tuple[Measure, Measure]:
-    """Maps that are one class of the furniture (a quarter of the cells), up to a share of wrong cells."""
+    """Maps that are one class of the furniture (a quarter of the cells), with a fraction of wrong cells."""
     descriptor = furniture(40, rng)
     maps = (descriptor == 2) ^ (rng.random(descriptor.shape) < error)
     return dependence(maps, descriptor, np.ones_like(maps), np.arange(40), draws, rng)
@@ -171,13 +171,14 @@ def planted(error: float, rng: np.random.Generator, draws: int = 99) -> tuple[Me
 def test_a_planted_dependence_is_found_and_sized(error, rng):
     bits, auc = planted(error, rng)
     assert bits.p_value == auc.p_value == 0.01
-    # white given the class is 1 - error, given another one it is error
+    # probability of white: 1 - error in the class, error elsewhere
     white = 0.25 * (1 - error) + 0.75 * error
     conditional = entropy(error) if error else 0
     assert bits.own == pytest.approx(entropy(white) - conditional, abs=0.08)
-    hit, alarm = 0.25 * (1 - error) / white, 0.25 * error / (1 - white)  # of a white cell, of a black one
+    # probability of the class in a white cell, in a black cell
+    hit, alarm = 0.25 * (1 - error) / white, 0.25 * error / (1 - white)
     assert auc.own == pytest.approx(0.5 + (hit - alarm) / 2, abs=0.03)
-    # chance is chance, however strong the dependence
+    # exchanged maps show no dependence
     assert bits.exchanged < 0.02 and abs(auc.exchanged - 0.5) < 0.1
     for measure in (bits, auc):
         low, high = measure.chance()
@@ -185,7 +186,7 @@ def test_a_planted_dependence_is_found_and_sized(error, rng):
         assert np.mean(measure.differences > 0) == pytest.approx(0.5, abs=0.2)
 
 
-def test_what_varies_with_the_place_on_the_map_alone_is_no_dependence(rng):
+def test_a_common_variation_with_map_position_is_no_dependence(rng):
     """Classes and textures may both change from near to far: exchanged maps do so too."""
     far = np.arange(SIDE)[:, None] / SIDE
     descriptor = (rng.random((40, SIDE, SIDE)) < far).astype(int)
@@ -232,7 +233,7 @@ def test_bad_input_is_named(rng):
         dependence(maps, maps.astype(int), maps, np.arange(6) // 2, 5, rng)
     with pytest.raises(InputError, match="same shape"):
         dependence(maps, maps[:5].astype(int), maps, np.arange(6), 5, rng)
-    with pytest.raises(InputError, match="a group a view"):
+    with pytest.raises(InputError, match="a group per view"):
         dependence(maps, maps.astype(int), maps, np.arange(5), 5, rng)
 
 

@@ -54,8 +54,8 @@ def test_iou_by_hand():
     assert counts.pixel_iou() == pytest.approx(3 / 6)
 
 
-def test_averages_differ_as_they_should():
-    """A rare class weighs as much as a common one in class IoU, by its area in pixel IoU; an absent one nothing."""
+def test_class_iou_ignores_area_and_pixel_iou_does_not():
+    """A class that is absent everywhere counts in neither."""
     counts = Counts(np.array([[90, 0, 0]]), np.array([[100, 10, 0]]))
     assert counts.class_iou() == pytest.approx((0.9 + 0) / 2)
     assert counts.pixel_iou() == pytest.approx(90 / 110)
@@ -67,7 +67,7 @@ def test_averages_differ_as_they_should():
 @settings(max_examples=25, deadline=None)
 @given(SEEDS)
 def test_agrees_with_torchmetrics(seed):
-    """Its confusion matrix, with cells outside the FOV as `ignore_index`; it scores an absent class 0."""
+    """With cells outside the FOV as `ignore_index`; torchmetrics scores an absent class 0."""
     predicted, truth, fov, scene = maps(seed)
     counts = count(predicted, truth, fov, scene, 2)
     ours = np.nan_to_num(counts.iou_per_class())
@@ -147,20 +147,17 @@ def batches_of(seed: int):
 
 
 def test_evaluate_thresholds_probabilities():
-    """Logits through a sigmoid, strictly above the threshold; booleans as they are; batches of any size."""
+    """White is a probability above one half; binary maps are not changed; batches may have any size."""
     logits, whole, batches = batches_of(0)
-    for threshold in (0.3, 0.5, 0.8):
-        predicted = logits > float(np.log(threshold / (1 - threshold)))
-        expected = count(predicted, whole["target"], whole["fov"], whole["scene"], 2)
-        assert evaluate(lambda batch: batch["rgb"], batches, 2, 3, threshold) == expected
-        maps_at = evaluate(lambda batch: batch["rgb"].sigmoid() > threshold, batches, 2, 3)  # noqa: B023
-        assert maps_at == expected
+    expected = count(logits > 0, whole["target"], whole["fov"], whole["scene"], 2)
+    assert evaluate(lambda batch: batch["rgb"], batches, 2, 3) == expected
+    assert evaluate(lambda batch: batch["rgb"] > 0, batches, 2, 3) == expected
     undecided = evaluate(lambda batch: torch.zeros_like(batch["target"]), batches, 2, 3)
     assert undecided.intersection.sum() == 0, "a probability of exactly one half is no detection"
 
 
 def test_model_predictor():
-    """A model is used in evaluation mode, without a graph, and gets the two images."""
+    """A model runs in evaluation mode, without a graph, on both images."""
 
     class Halved(nn.Module):
         def __init__(self):
@@ -184,8 +181,8 @@ def scenes_with(rng: np.random.Generator, mean: float, scenes: int = 40) -> Coun
     return Counts((1000 * scores).astype(np.int64)[:, None], np.full((scenes, 1), 1000))
 
 
-def test_interval_covers_as_often_as_it_says():
-    """200 experiments, 90 % intervals: the true mean is inside in 90 % of them, less a little for few scenes."""
+def test_90_percent_intervals_cover_the_true_mean_in_90_percent_of_experiments():
+    """Slightly less with few scenes."""
     rng = np.random.default_rng(0)
     inside = 0
     for _ in range(200):
@@ -196,7 +193,7 @@ def test_interval_covers_as_often_as_it_says():
 
 
 def test_difference_is_paired():
-    """Two methods that differ by .02 in every scene: scenes vary far more, and still the sign is certain."""
+    """Two methods that differ by .02 in every scene: the sign is certain, although scenes vary far more."""
     rng = np.random.default_rng(1)
     theirs = scenes_with(rng, 0.5)
     ours = Counts(theirs.intersection + 20, theirs.union)

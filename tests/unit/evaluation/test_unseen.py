@@ -1,4 +1,4 @@
-"""Modalities without a name among the classes: masks of both sensors against each other, and counts by hand."""
+"""Modalities beyond the classes: masks of image and map against each other, and counts by hand."""
 
 from types import SimpleNamespace
 
@@ -25,8 +25,8 @@ def views() -> tuple[list[View], np.ndarray]:
     return [source.draw() for _ in range(6)], source.scene.instance_label
 
 
-def test_masks_of_both_sensors_are_the_same_surfaces(views):
-    """Where both see the very same texel, a pixel and its cell must be of the same object, label, and so on."""
+def test_masks_of_image_and_map_agree_on_common_surfaces(views):
+    """A pixel and its cell with the same texel must agree in object, label, and so on."""
     seen = dict.fromkeys(MODALITIES, 0)
     for number, view in enumerate(views[0]):
         masks = unseen_masks(view, views[1], CAMERA, np.random.default_rng(number))
@@ -34,10 +34,10 @@ def test_masks_of_both_sensors_are_the_same_surfaces(views):
         on_map = cell < 40**2
         texels = view.bev_texel.reshape(-1, 3)[cell[on_map]]
         same = (view.fpv_texel[on_map] == texels).all(-1) & (texels[:, 0] >= 0)
-        for name in set(MODALITIES) - {"outlines"}:  # an edge is one of the image or of the map
+        for name in set(MODALITIES) - {"outlines"}:  # edges differ between image and map
             fpv, bev = (images.reshape(len(images), -1) for images in masks[name])
             agree = fpv[:, on_map.ravel()][:, same] == bev[:, cell[on_map]][:, same]
-            assert agree.mean() > 0.995, name  # a texel is 1 cm wide, and may be half in
+            assert agree.mean() > 0.995, name  # a texel of 1 cm may cross an edge
             seen[name] += int(fpv.any()) + int(bev.any())
         assert masks["outlines"][0].shape == (1, 64, 64) and masks["outlines"][1].shape == (1, 40, 40)
     assert min(seen[name] for name in set(MODALITIES) - {"outlines"}) > 0
@@ -48,7 +48,7 @@ def test_masks_by_hand(views):
     masks = unseen_masks(view, views[1], CAMERA, np.random.default_rng(0))
     labels = masks["random labels"]
     for images, texel in zip(labels, (view.fpv_texel, view.bev_texel)):
-        assert np.array_equal(images.sum(axis=0), texel[..., 0] >= 0)  # one label each, where there is a surface
+        assert np.array_equal(images.sum(axis=0), texel[..., 0] >= 0)  # one label per surface pixel
     other = unseen_masks(view, views[1], CAMERA, np.random.default_rng(1))["random labels"]
     assert 0.5 < (other[0] != labels[0]).any(axis=0).mean() < 0.95  # three in four change
     seats = np.isin(views[1][view.bev_instance], [LABELS.index(n) for n in ("chair", "sofa", "bed", "toilet")])
@@ -66,9 +66,9 @@ def test_counts_are_sums_over_the_masks_of_a_modality(tmp_path, monkeypatch):
     assert np.array_equal(counts["a.2"].intersection, counts["a.2"].union)
     assert not counts["c"].intersection.any() and np.array_equal(counts["c"].union, counts["a.2"].union)
     assert np.array_equal(counts["d"].intersection, counts["a.2"].union)
-    # everywhere white: each mask of a modality counts the whole field of view once
-    area = counts["d"].union[0] / counts["d"].union[0, list(MODALITIES).index("to sit on")]
-    assert area[list(MODALITIES).index("random labels")] == 4 and area[list(MODALITIES).index("outlines")] == 1
+    # all white: each mask of a modality counts the whole field of view once
+    area = counts["d"].union[0] / counts["d"].union[0, MODALITIES.index("to sit on")]
+    assert area[MODALITIES.index("random labels")] == 4 and area[MODALITIES.index("outlines")] == 1
     assert list(unseen_table(counts)["(a.2)"].str[:5]) == ["100.0"] * len(MODALITIES)
 
 

@@ -1,4 +1,4 @@
-"""Records and their galleries: what is written is read, and a damaged file says so."""
+"""Records and galleries: they are read as written, and damaged files are refused."""
 
 import json
 import os
@@ -62,7 +62,7 @@ def test_maps_of_any_size_come_back(tmp_path_factory, maps):
     assert found.dtype == bool and np.array_equal(found, maps)
 
 
-def test_records_of_before_a_call_for_fresh_ones_are_not_found(tmp_path, monkeypatch):
+def test_records_older_than_a_call_for_fresh_results_are_not_found(tmp_path, monkeypatch):
     store = RunStore(tmp_path)
     store.write(record(), MAPS)
     os.utime(store.path(record().key), (1000, 1000))
@@ -124,7 +124,7 @@ def test_an_interrupted_write_leaves_no_record(tmp_path):
     assert [path.name for path in tmp_path.rglob("*.*")] == ["c-seed0-abc.npz"]
 
 
-def test_origin_says_where_a_number_comes_from():
+def test_origin_holds_device_versions_and_revision_but_no_user_path():
     found = origin("cpu", git_revision())
     assert json.loads(json.dumps(found)) == found
     assert found["device"] == "cpu" and set(found["versions"]) > {"torch", "numpy"}
@@ -138,14 +138,16 @@ def test_a_result_is_computed_once_for_each_configuration(tmp_path):
         made.append(len(made))
         return {"value": made[-1], "spread": (0.5, 1.5)}
 
-    # as JSON has it, in its order: a table made of it looks the same the first time and later
-    first, second = ([*recorded(path, "a", {"weights": "x"}, compute).items()] for _ in range(2))
+    # types and order are those of JSON, computed or read
+    first, second = ([*recorded(path, "a", {"weights": "x"}, compute, "cuda").items()] for _ in range(2))
     assert first == second == [("spread", [0.5, 1.5]), ("value", 0)]
-    assert recorded(path, "a", {"weights": "y"}, compute)["value"] == 1
-    assert made == [0, 1] and {"key", "config", "origin", "cost"} <= set(json.loads(path.read_text()))
+    assert recorded(path, "a", {"weights": "y"}, compute, "cuda")["value"] == 1
+    written = json.loads(path.read_text())
+    assert made == [0, 1] and set(written) == {"key", "config", "origin", "cost", "result"}
+    assert written["origin"]["device"] == "cuda"
     path.write_text("{}")
     with pytest.raises(InputError, match=r"a\.json: expected a record, found KeyError"):
-        recorded(path, "a", {"weights": "y"}, compute)
+        recorded(path, "a", {"weights": "y"}, compute, "cuda")
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ class Then:
 
 @dataclass(frozen=True)
 class Grown(Then):
-    warmup: int = 0  # a field that is newer than the record
+    warmup: int = 0  # newer than the record
 
 
 @dataclass(frozen=True)
@@ -172,17 +174,17 @@ def test_a_record_survives_a_new_field_but_not_a_new_default(tmp_path):
         made.append(0)
         return {}
 
-    recorded(path, "a", {"train": Then(3)}, compute)
-    recorded(path, "a", {"train": Grown(3)}, compute)
-    assert len(made) == 1
-    recorded(path, "a", {"train": Grown(3, warmup=1)}, compute)
-    assert len(made) == 2
-    recorded(path, "a", {"train": Then(3)}, compute)
-    recorded(path, "a", {"train": OtherDefault(3)}, compute)  # the key is the same, the stored value is not
-    assert len(made) == 4
+    def computed(train: Then | OtherDefault) -> int:
+        recorded(path, "a", {"train": train}, compute, "cpu")
+        return len(made)
+
+    assert computed(Then(3)) == computed(Grown(3)) == 1
+    assert computed(Grown(3, warmup=1)) == 2
+    assert computed(Then(3)) == 3
+    assert computed(OtherDefault(3)) == 4  # the key is the same, the stored value is not
 
 
-def test_a_revision_is_dirty_where_the_code_was_changed(tmp_path):
+def test_a_revision_is_dirty_if_the_code_was_changed(tmp_path):
     def git(*arguments: str) -> None:
         settings = ("-c", "user.name=a", "-c", "user.email=a@b")
         subprocess.run(["git", *settings, *arguments], cwd=tmp_path, check=True, capture_output=True)
@@ -196,9 +198,9 @@ def test_a_revision_is_dirty_where_the_code_was_changed(tmp_path):
     git("commit", "-m", "a")
     clean = git_revision(code)
     assert re.fullmatch("[0-9a-f]{12}", clean)
-    report.write_text("{}")  # what a reproduction writes
+    report.write_text("{}")  # as a reproduction does
     assert git_revision(code) == clean
-    installed = tmp_path / ".venv/code"  # in an environment inside a repository that ignores it
+    installed = tmp_path / ".venv/code"  # an environment in an ignored folder of the repository
     installed.mkdir(parents=True)
     (tmp_path / ".gitignore").write_text(".venv/\n")
     assert git_revision(installed) == "unknown"

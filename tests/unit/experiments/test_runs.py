@@ -1,4 +1,4 @@
-"""Runs and their records, end to end on a scale of its own: two training homes, four steps."""
+"""Runs and their records, end to end at a tiny scale: one training home, four steps."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ TINY = replace(
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A workspace's root with four rows recorded."""
+    """The root of a workspace in which four rows are recorded."""
     root = tmp_path_factory.mktemp("root")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SCALES, "tiny", TINY)
@@ -54,7 +54,7 @@ def workspace(root, monkeypatch):
     return Workspace("tiny", root=root)
 
 
-def test_a_record_is_read_and_not_computed_again_until_a_fresh_one_is_asked_for(workspace, monkeypatch):
+def test_a_record_is_read_until_a_fresh_one_is_asked_for(workspace, monkeypatch):
     run = Run(PROJECTION, workspace)
     path = run.store.path(run.key)
     before = path.stat().st_mtime_ns
@@ -74,7 +74,7 @@ def test_every_row_of_every_table_is_a_run_and_each_run_is_one_row():
     trained = [e for e in EXPERIMENTS.values() if e.network]
     assert len({replace(e, row="") for e in EXPERIMENTS.values()}) == len(EXPERIMENTS)
     assert {e.network for e in trained} == set(VARIANTS)
-    # only networks that are not zero-shot ever see the classes, and only the oracle is tested with true depth
+    # only networks that are not zero-shot are trained on classes, and only the oracle is tested with true depth
     assert {e.row for e in trained if e.stream == "classes"} == {"b.1", "b.2", "b.3"}
     assert [e.row for e in EXPERIMENTS.values() if e.test_depth == "true"] == ["a.1"]
     with pytest.raises(InputError, match=r"row: expected one of a\.1, .*, found 'z'"):
@@ -82,7 +82,7 @@ def test_every_row_of_every_table_is_a_run_and_each_run_is_one_row():
 
 
 def test_a_misspelt_depth_stream_or_split_is_an_error(workspace):
-    """True depth in place of a misspelt estimated one would leak what only the oracle may know."""
+    """True depth in place of misspelt estimated depth would make the row an oracle."""
     for field, value in (("test_depth", "predicted"), ("train_depth", ("true", "estimate")), ("stream", "texture")):
         with pytest.raises(InputError, match=f"{field}: expected one of .*, found"):
             replace(RESIDUAL, **{field: value})
@@ -94,8 +94,8 @@ def test_a_misspelt_depth_stream_or_split_is_an_error(workspace):
 
 
 @pytest.mark.parametrize("row, predicted", [("a.1", False), ("a.2", True)])
-def test_projections_are_what_their_depth_says(workspace, row, predicted):
-    """Row (a.2) must never see true depth: its counts are those of the estimator's depth, view by view."""
+def test_projections_use_the_depth_of_their_row(workspace, row, predicted):
+    """Row (a.2) must never read true depth: its counts are those of estimated depth, view by view."""
     test, camera = workspace.views("test"), workspace.scale.camera
     estimator = DepthPretraining(workspace).estimator
     intersection, union = np.zeros((2, 8), int), np.zeros((2, 8), int)
@@ -108,14 +108,14 @@ def test_projections_are_what_their_depth_says(workspace, row, predicted):
         intersection[scene] += (found & truth & inside).sum(axis=(1, 2))
         union[scene] += ((found | truth) & inside).sum(axis=(1, 2))
     counts = Run(experiment(row), workspace).record().counts
-    # the batch that a photograph passes in may change the last digit of its depth
+    # the size of a batch may change the last digit of a depth
     assert abs(counts.intersection - intersection).max() <= (2 if predicted else 0)
     assert abs(counts.union - union).max() <= (2 if predicted else 0)
     assert counts.pixel_iou() > (0.0 if predicted else 0.1)
 
 
-def test_each_row_is_trained_on_the_auxiliary_maps_that_it_names(workspace, monkeypatch):
-    """The loss of a batch is that of the row's own auxiliary maps, wherever they stand in it."""
+def test_each_row_is_trained_on_its_own_auxiliary_maps(workspace, monkeypatch):
+    """The auxiliary loss of a batch compares with the channels of the row."""
     objectives = {}
     monkeypatch.setattr(
         runs, "train", lambda model, *arguments, objective, **named: objectives.update(pair=(model, objective))
@@ -135,15 +135,15 @@ def test_the_papers_choices_are_one_row_away_from_ours(workspace):
     ours, paper = (Run(EXPERIMENTS[row], workspace).config for row in ("c", "c.paper"))
     reduced = SCALES["reduced"]
     assert EXPERIMENTS["c.paper"].texture(reduced).scales == (1.0, 1.0) != EXPERIMENTS["c"].texture(reduced).scales
-    blank = {row: EXPERIMENTS[row].empty_fraction(reduced) for row in ("c", "c.paper", "b.2")}
-    assert blank["c"] > 0 == blank["c.paper"] == blank["b.2"]
-    upright = {row: EXPERIMENTS[row].extruded_fraction(reduced) for row in ("c", "c.paper", "c.mesh")}
-    assert upright["c"] > 0 == upright["c.paper"] == upright["c.mesh"]
+    empty = {row: EXPERIMENTS[row].empty_fraction(reduced) for row in ("c", "c.paper", "b.2")}
+    assert empty["c"] > 0 == empty["c.paper"] == empty["b.2"]
+    extruded = {row: EXPERIMENTS[row].extruded_fraction(reduced) for row in ("c", "c.paper", "c.mesh")}
+    assert extruded["c"] > 0 == extruded["c.paper"] == extruded["c.mesh"]
     assert (
         EXPERIMENTS["c"].model(reduced).foreground_prior < 0.5 == EXPERIMENTS["c.paper"].model(reduced).foreground_prior
     )
     assert EXPERIMENTS["c"].model(reduced).ground_start and not EXPERIMENTS["c.paper"].model(reduced).ground_start
-    assert ours["model"] == paper["model"]  # this scale's choices are the paper's already
+    assert ours["model"] == paper["model"]  # this scale makes the paper's choices
 
 
 def test_stages_of_depth_follow_each_other(workspace):
@@ -189,7 +189,7 @@ def test_records_of_rows_are_those_of_every_recorded_seed(workspace):
         second.store.path(second.key).unlink()
 
 
-def test_the_record_says_where_it_comes_from(workspace):
+def test_a_record_holds_configuration_origin_and_cost(workspace):
     record = Run(ZERO_BEV, workspace).record()
     assert record.config["train"]["steps"] == 4 and record.config["data"]["scenes"]["views"] == 3
     assert record.origin["device"] == "cpu" and "torch" in record.origin["versions"]
@@ -210,7 +210,7 @@ def test_the_key_follows_what_a_run_depends_on_and_nothing_else(workspace, monke
     assert Run(PROJECTION, changed).key != projection
 
 
-def test_the_gallery_holds_what_the_kept_weights_predict(workspace):
+def test_the_gallery_holds_the_predictions_of_the_saved_weights(workspace):
     record = Run(ZERO_BEV, workspace).record()
     views = gallery(workspace)
     maps = Run(ZERO_BEV, workspace).store.maps(record.key)
@@ -233,11 +233,11 @@ def test_training_never_opens_a_test_scene(workspace, monkeypatch, tmp_path):
     assert not {*split.train, *split.validation} & {*split.test}
 
 
-def test_spot_check_agrees_with_an_honest_record_and_not_with_a_changed_one(workspace):
+def test_spot_check_agrees_only_with_an_unchanged_record(workspace):
     assert spot_check(workspace, "a.1").agrees
     path = Run(PROJECTION, workspace).store.path(Run(PROJECTION, workspace).key)
-    honest = path.read_text()
-    record = json.loads(honest)
+    original = path.read_text()
+    record = json.loads(original)
     counts = record["result"]["counts"]
     counts["intersection"] = [[cells // 2 for cells in scene] for scene in counts["intersection"]]
     path.write_text(json.dumps(record))
@@ -245,7 +245,7 @@ def test_spot_check_agrees_with_an_honest_record_and_not_with_a_changed_one(work
         changed = spot_check(workspace, "a.1")
         assert not changed.agrees and "DOES NOT AGREE" in str(changed)
     finally:
-        path.write_text(honest)
+        path.write_text(original)
     with pytest.raises(InputError, match=r"expected one of the recorded rows a\.1, a\.2, c, d, found 'z'"):
         spot_check(workspace, "z")
 

@@ -345,7 +345,9 @@ def test_true_flow_by_hand():
 def pair_of_a_moving_box(seed: int) -> tuple[MovingPair, tuple[int, int, int]]:
     things = [*room((5, 4, 2.5)), box("chair", (2.2, 1.9, 0), (2.8, 2.5, 0.8))]
     scene = build(things)
-    return moving_pair(scene, CAMERA, np.random.default_rng(seed)), scene.instances[-1].color
+    pair = moving_pair(scene, CAMERA, np.random.default_rng(seed))
+    assert pair is not None
+    return pair, scene.instances[-1].color
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -358,6 +360,10 @@ def test_true_flow_leads_to_the_object_in_the_second_photograph(seed):
     colors = pair.second[ends[inside, 1], ends[inside, 0]].astype(int)
     assert inside.mean() > 0.3 and np.mean(np.abs(colors - color).max(axis=-1) < 12) > 0.85
     assert not pair.flow_px[~pair.on_object].any() and 0.2 <= np.linalg.norm(pair.motion_m) <= 0.6
+
+
+def test_a_home_without_movable_objects_has_no_pair():
+    assert moving_pair(build(room((5, 4, 2.5))), CAMERA, np.random.default_rng(0)) is None
 
 
 def test_arrows_are_as_wrong_as_the_depth_they_come_from():

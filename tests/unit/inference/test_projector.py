@@ -15,7 +15,7 @@ import zerobev
 from zerobev.common.errors import InputError
 from zerobev.config import SCALES, CameraConfig
 from zerobev.experiments.depth_pretraining import DepthPretraining
-from zerobev.experiments.release import SCALE, halve, released_runs
+from zerobev.experiments.release import SCALE, halve, sources
 from zerobev.experiments.workspace import Workspace
 from zerobev.geometry.projection import inverse_project
 from zerobev.inference.modality import BinaryImages
@@ -76,7 +76,7 @@ def test_the_package_is_light_until_it_is_used():
 def test_the_weights_are_small_and_come_from_the_recorded_runs():
     files = {path.stem: path for path in FOLDER.glob("*")}
     assert set(files) == {*ROWS, DEPTH} and sum(path.stat().st_size for path in files.values()) < 12e6
-    assert {name: run_of(path) for name, path in files.items()} == released_runs()
+    assert {name: run_of(path) for name, path in files.items()} == {name: one.key for name, one in sources().items()}
     for row in ROWS:
         assert (ROOT / "reports" / SCALE / "records" / f"{run_of(files[row])}.json").exists()
     assert json.loads((ROOT / "reports" / SCALE / "depth.json").read_text())["key"] == run_of(files[DEPTH])

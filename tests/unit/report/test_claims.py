@@ -1,4 +1,4 @@
-"""Verdicts on claims, and quotients of rows, from records whose numbers are known by hand."""
+"""Verdicts on claims, and quotients of rows, from records with known numbers."""
 
 import numpy as np
 import pytest
@@ -39,13 +39,13 @@ def test_verdicts_on_orderings(gain, expected, metric):
     objects = [np.mean(TABLES[1][row].per_class[2:]) for row in ("d", "c")]
     published = {"class": 3.5, "pixel": 0.7, "floor": -0.2, "objects": objects[0] - objects[1]}[metric]
     assert verdict.paper == pytest.approx(published, abs=0.06)
-    assert verdict == judge(claim, records)  # no chance in it
+    assert verdict == judge(claim, records)  # deterministic
 
 
 @pytest.mark.parametrize(
     "offsets, expected", [((0, 0.5, 0.2), "holds"), ((0, 3, 1), "does not hold"), ((1, 0, 0.9), "holds")]
 )
-def test_verdicts_on_similar_rows_look_at_the_lowest_and_the_highest(offsets, expected):
+def test_verdicts_on_similar_rows_compare_the_lowest_and_the_highest(offsets, expected):
     base = np.linspace(20, 40, 6)[:, None] + np.zeros(8)
     rows = ("c.10", "c.25", "c")
     records = [record(row, base + offset) for row, offset in zip(rows, offsets)]
@@ -60,7 +60,7 @@ def test_rows_whose_spread_straddles_the_limit_are_undecided():
     assert judge(claim, [record("c.I", base), record("c.II", base + noise)]).verdict == "undecided"
 
 
-def test_verdict_on_one_class_looks_at_that_class():
+def test_verdict_on_one_class_uses_that_class():
     worse = np.full((6, 8), 30.0)
     better = worse + 5 * np.eye(8)[LABELS.index("floor")] - 5 * np.eye(8)[LABELS.index("bed")]
     records = [record("c", worse), record("d", better)]
@@ -100,7 +100,7 @@ def test_ratios():
         pytest.approx(0.75),
         pytest.approx(0.75),
     )
-    # as the paper's own text gives them, to two digits
+    # as in the paper's text, to two digits
     published = [round(compare(ratio, [])["paper"], 2) for ratio in RATIOS]
     assert published == [0.74, 1.36, 0.84, 1.38, 0.8, 0.85, 0.91, 0.86]
     assert compare(RATIOS[2], records)["ours"] is None

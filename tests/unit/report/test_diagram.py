@@ -1,4 +1,4 @@
-"""Diagrams say what the networks do: order, shapes and parameters of the blocks."""
+"""Diagrams show order, shapes and parameters of the blocks."""
 
 import torch
 from torch import nn
@@ -11,7 +11,7 @@ SMOKE = SCALES["smoke"]
 
 
 class Backwards(nn.Module):
-    """Blocks that are called in another order than they are made in; one is a list, one returns two maps."""
+    """Blocks that are called in another order than they are made; one is a list, one is never called."""
 
     def __init__(self):
         super().__init__()

@@ -1,4 +1,4 @@
-"""The page, the tables and the verdicts that are written beside the records."""
+"""The page, tables and verdicts of a report."""
 
 import json
 import re
@@ -24,7 +24,7 @@ BASE = np.linspace(20, 40, 6)[:, None] + np.zeros(8)
 
 
 class Tags(HTMLParser):
-    """The nesting of a page, and what it refers to."""
+    """The nesting and the links of a page."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ def report(tmp_path, monkeypatch):
     return workspace.reports, records
 
 
-def test_files_hold_what_the_records_say(report):
+def test_files_hold_the_numbers_of_the_records(report):
     folder, records = report
     for number in (*TABLES, 6):
         written = pd.read_csv(folder / f"tables/table{number}.csv", index_col=["row", "method", "source"])
@@ -68,7 +68,7 @@ def test_files_hold_what_the_records_say(report):
     assert first["paper"] == pytest.approx(24.2 / 32.8, abs=1e-3) and first["ours"] == pytest.approx(35 / 30, abs=1e-2)
 
 
-def test_page_is_whole_and_refers_to_its_own_figures_alone(report):
+def test_page_is_well_formed_and_links_only_to_its_own_files(report):
     folder, _ = report
     text = (folder / "index.html").read_text()
     tags = Tags()
@@ -80,7 +80,7 @@ def test_page_is_whole_and_refers_to_its_own_figures_alone(report):
     assert "not run" in text and "<td>35.0</td>" in text  # the mean of both seeds of (c)
 
 
-def test_an_empty_report_is_a_page_too(tmp_path):
+def test_a_report_without_records_has_a_page(tmp_path):
     page = write_summary(Workspace("smoke", root=tmp_path))
     assert "No row is recorded" in page.read_text()
     assert len(pd.read_csv(page.parent / "tables/table1.csv")) == len(TABLES[1])

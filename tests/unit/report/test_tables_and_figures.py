@@ -1,4 +1,4 @@
-"""Tables, verdicts and pictures from records whose numbers are known by hand; the paper's own sums."""
+"""Tables, verdicts and figures from records with known numbers; the averages of the paper."""
 
 import re
 
@@ -30,7 +30,7 @@ def test_printed_averages_are_means_of_the_printed_classes():
             assert row.class_iou == pytest.approx(np.mean(row.per_class), abs=0.1), (number, name)
 
 
-def test_rows_that_the_paper_prints_twice_are_the_same():
+def test_rows_that_the_paper_prints_twice_are_equal():
     for name in ("c", "d"):
         copies = [rows[name] for rows in TABLES.values() if name in rows]
         assert len(copies) >= 3
@@ -52,7 +52,7 @@ def test_table_by_hand():
     assert ours.tolist() == pytest.approx([15, 20, 30, 40, 50, 60, 70, 82.5, 45.9, 45.9])
 
 
-def test_pixel_average_weighs_by_area_and_class_average_does_not():
+def test_pixel_average_depends_on_area_and_class_average_does_not():
     union = np.array([[100, 900, 0, 0, 0, 0, 0, 0]])
     counts = Counts(union * [[1, 0, 0, 0, 0, 0, 0, 0]], union)
     one = run_record("c-0", counts)
@@ -116,7 +116,7 @@ def test_maps_are_drawn_like_labels_with_the_floor_below():
     assert np.array_equal(maps_image(everywhere, fov), label_image(expected, fov))
 
 
-def test_plan_shows_a_home_in_world_metres():
+def test_top_view_is_in_world_metres():
     label, extent = top_view(build([*room((6, 4, 2.5), corner=(1, -2, 0)), box("bed", (5, -1, 0), (6.5, 1, 0.5))]))
     assert extent == pytest.approx((1, 7, -2, 4))
     side = label.shape[0]
@@ -128,7 +128,7 @@ def test_plan_shows_a_home_in_world_metres():
     assert CameraConfig(fpv_px=4, bev_px=4).extent == (-2.5, 2.5, 0.0, 5.0)
 
 
-def test_checks_note_what_holds_and_stop_at_what_does_not():
+def test_checks_note_claims_that_hold_and_raise_for_others():
     checks = Checks()
     checks.holds("sum", "2", 1 + 1 == 2)
     checks.note("order", "c > d", "undecided")
@@ -140,7 +140,7 @@ def test_checks_note_what_holds_and_stop_at_what_does_not():
     pd.testing.assert_frame_equal(checks.table(), expected, check_dtype=False)
 
 
-def test_scoreboard_links_every_claim_to_a_notebook_that_is_there():
+def test_scoreboard_links_every_claim_to_an_existing_notebook():
     verdicts = [judge(claim, [record("c", [[30.0] * 8] * 3)]) for claim in (*CLAIMS, *OWN_CLAIMS)]
     _, _, *lines = scoreboard(verdicts).data.splitlines()
     assert [line.split("|")[1].strip() for line in lines] == [verdict.id for verdict in verdicts]
@@ -150,7 +150,7 @@ def test_scoreboard_links_every_claim_to_a_notebook_that_is_there():
         assert "**not run**" in line
 
 
-def test_masks_share_a_picture_each_in_a_grey_of_its_own():
+def test_flat_image_has_one_grey_per_mask():
     masks = np.zeros((2, 1, 3), bool)
     masks[0, 0, :2] = masks[1, 0, 1:] = True
     assert flat(masks).tolist() == [[1.0, 1.0, 0.4]]

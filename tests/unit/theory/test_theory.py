@@ -1,4 +1,4 @@
-"""The theory against what is known otherwise: loops over pixels, enumeration of all binary values, convex solvers."""
+"""The theory against references: loops over pixels, enumeration of all binary values, convex solvers."""
 
 from dataclasses import replace
 from itertools import product
@@ -37,7 +37,7 @@ COUNTS = ((1, 0), (1, 3), (2, 0), (2, 4), (3, 2), (4, 4), (6, 1))
 
 
 def steps_of_depth(rng: np.random.Generator, views: int) -> torch.Tensor:
-    """Depth images of columns that look at a few walls each, some beyond the map and some missing."""
+    """Depth images with a few walls per column, some beyond the map and some missing."""
     walls = rng.uniform(-0.3, 6.0, size=(views, 4, CAMERA.fpv_px)).repeat(4, axis=1).clip(min=0)
     return torch.from_numpy(walls + rng.uniform(0, 0.1, size=walls.shape) * (walls > 0)).float()
 
@@ -52,7 +52,7 @@ def test_positions_are_the_map_rows_of_the_projection(seed):
     cell, position = cells_of_pixels(depth, CAMERA), positions(depth, CAMERA)
     on_map = cell < CAMERA.bev_px**2
     assert on_map.any() and torch.equal(position[on_map], cell[on_map] // CAMERA.bev_px)
-    # the rays go on to the left and right of the map: a wider one of the same cells holds what its far part cuts off
+    # rays continue beyond the sides of the map: a wider map of the same cells contains them
     wide = cells_of_pixels(depth, replace(CAMERA, bev_px=60, bev_extent_m=15.0))
     near = (wide < 60**2) & (wide // 60 >= 40)
     assert torch.equal(position < CAMERA.bev_px, near)
@@ -75,7 +75,7 @@ def test_identity_values_and_the_normalised_indicator_are_average_pooling(seed):
     weights = uniform_attention(gamma)
     torch.testing.assert_close(pool(images, depth, CAMERA, "mean"), expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(weights @ columns(images), expected, atol=1e-6, rtol=0)
-    # the zero-shot stream of variant (e) is the same sum
+    # the zero-shot stream of variant (e) computes the same sum
     rays = reweigh(weights[:, None], images.flatten(0, 1)[:, None]).unflatten(0, (2, 3))  # B K C P 1
     torch.testing.assert_close(rays.permute(0, 2, 3, 1, 4).flatten(3).flatten(0, 1), expected, atol=1e-6, rtol=0)
 
@@ -132,7 +132,7 @@ def test_cross_attention_is_the_scaled_dot_product():
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_no_modality_is_further_off_than_the_total_variation(seed):
+def test_total_variation_bounds_the_error_of_every_modality(seed):
     rng = np.random.default_rng(seed)
     gamma = correspondence(steps_of_depth(rng, 1), CAMERA)
     attention = torch.from_numpy(rng.normal(size=gamma.shape)).softmax(-1)
@@ -141,12 +141,12 @@ def test_no_modality_is_further_off_than_the_total_variation(seed):
     seen = gamma.any(-1)
     values = torch.from_numpy(rng.random((len(gamma), gamma.shape[-1], 5)))
     assert ((difference @ values).abs() <= bound[..., None] + 1e-12)[seen].all()
-    worst = (difference.clamp(min=0).sum(-1), (-difference).clamp(min=0).sum(-1))  # h = 1 where alpha is too large
+    worst = (difference.clamp(min=0).sum(-1), (-difference).clamp(min=0).sum(-1))  # h = 1 if alpha is too large
     for reached in worst:
         torch.testing.assert_close(reached[seen], bound[seen])
 
 
-def test_training_the_aux_stream_makes_the_zero_shot_stream_right():
+def test_training_the_aux_stream_trains_the_zero_shot_stream():
     rng = np.random.default_rng(3)
     net, seen = learned(rng, value=(4, 4))
     uniform = uniform_attention(seen.gamma)
@@ -158,7 +158,7 @@ def test_training_the_aux_stream_makes_the_zero_shot_stream_right():
     assert progress.step == list(range(0, 301, 10))
     assert progress.divergence[-1] < 0.4 * progress.divergence[0] and progress.loss[-1] < 0.1 * progress.loss[0]
     assert zero_shot_error(net, seen, unseen, uniform @ unseen) < 0.4 * before
-    # what the modality is turned into went to the value projection, which the zero-shot stream does not have
+    # the translation of the modality is in the value projection, which the zero-shot stream does not use
     torch.testing.assert_close(net.value.detach(), translation, atol=0.3, rtol=0)
     assert divergence(net, seen) == pytest.approx(progress.divergence[-1], rel=0.2)
 
@@ -226,9 +226,10 @@ def test_the_worst_case_is_the_minimax(inside):
 
 
 def looking_at(position: torch.Tensor, rows: range, stride: int, wanted: torch.Tensor) -> torch.Tensor:
-    """An attention of one head that looks at a feature over a wanted pixel of its position, and else at the top row.
+    """An attention of one head on a feature with a pixel of its position.
 
-    position: (H, W); wanted: (H, W) bool, pixels it looks at for positions that no pixel falls into
+    position: (H, W); wanted: (H, W) bool, pixels to attend to for positions without pixels. Without such a pixel, all
+    attention is on the top row.
     """
     size = -(-position.shape[0] // stride)
     weights = torch.zeros(size, 1, len(rows), size)
@@ -241,10 +242,10 @@ def looking_at(position: torch.Tensor, rows: range, stride: int, wanted: torch.T
 
 
 @pytest.mark.parametrize("knows_depth", (True, False))
-def test_attention_is_measured_where_cells_are_seen_raised_or_hidden(knows_depth, monkeypatch):
+def test_attention_is_measured_on_floor_raised_and_hidden_cells(knows_depth, monkeypatch):
     scale = replace(config.scale("smoke"), camera=CameraConfig(fpv_px=32, bev_px=20))
     net = build("c", scale.camera, replace(scale.model, heads=1))
-    # a level floor up to 4 m with a box on it that stands at 2 m in the left half and hides the floor behind
+    # a level floor up to 4 m; in the left half a box at 2 m hides the floor behind it
     depth = flat_floor(scale.camera).clamp(max=4.0)
     floor = depth < 4.0
     box = (torch.arange(32)[:, None] >= 8) & (torch.arange(32) < 16) & (depth > 2.0)
@@ -262,7 +263,7 @@ def test_attention_is_measured_where_cells_are_seen_raised_or_hidden(knows_depth
         assert (share.stack().dropna() == 1).all() and share.loc[2].notna().all()
     else:
         assert share.loc[1:, "floor"].max() < 0.5
-    # what the box hides: floor behind it, in its columns alone, farther than 2 m and nearer than the wall at 4 m
+    # the box hides floor behind it: in its own columns, farther than 2 m and nearer than the wall at 4 m
     assert cells["hidden"].tolist()[:2] == [0, 0] and cells["hidden"].sum() > 0
     assert cells["raised"].sum() > 0 and cells.loc[0, "floor"] == 0  # nearer floor is below the image
 
@@ -282,6 +283,6 @@ def test_a_column_of_attention_is_a_distribution_over_image_rows():
     for weights in columns_of_attention:
         assert weights.shape == (scale.model.heads, 20, 32)
         torch.testing.assert_close(weights.sum(-1), torch.ones(weights.shape[:2]))
-    assert torch.equal(columns_of_attention[0], columns_of_attention[1])  # under one feature, at every stride
-    far = net.attention(rgb, zero)[-1].cross[-1]  # (16, heads, P, 16): the finest map feeds the farthest band
+    assert torch.equal(columns_of_attention[0], columns_of_attention[1])  # one feature at every stride
+    far = net.attention(rgb, zero)[-1].cross[-1]  # (16, heads, P, 16): the farthest band uses the finest map
     torch.testing.assert_close(columns_of_attention[2][:, 0, ::2] * 2, far[8, :, 0])
