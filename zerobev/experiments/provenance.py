@@ -3,7 +3,6 @@
 import os
 import platform
 import re
-import resource
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -53,5 +52,7 @@ def peak_memory_mb() -> float:
     found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
     if found:  # Linux, where `getrusage` includes the parent process's peak
         return round(int(found[1]) / 1024, 1)
+    import resource  # Windows has none
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS, else KiB
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
