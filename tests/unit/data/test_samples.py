@@ -265,7 +265,7 @@ def test_depth_may_be_replaced(views, bank, dtype):
     batch, given = (as_float(stream("depth", each, bank).batch(0)) for each in (predicted, views))
     assert torch.equal(batch["target"], inverse_project(batch["zero"], batch["depth"], CAMERA))
     assert torch.equal(batch["zero"], given["zero"]) and not torch.equal(batch["target"], given["target"])
-    with pytest.raises(InputError, match=r"depth maps: expected \[5, 3\] views a shard, found \[3, 5\]"):
+    with pytest.raises(InputError, match=r"depth maps: expected \[5, 3\] views per shard, found \[3, 5\]"):
         views.with_depth(maps[::-1])
     with pytest.raises(InputError, match=r"depth maps: expected views of \(24, 24\), found \(20, 24\)"):
         views.with_depth([map_[:, :20] for map_ in maps]).locate(0)
