@@ -108,7 +108,7 @@ def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> di
     for _, (name, stream) in itertools.product(range(repeats), streams.items()):
         looked_up[name].append(_seconds_each(stored, stream.pair, 0, rng))
         if name in textures:
-            rerenderer.wear(textures[name])
+            rerenderer.set_texture(textures[name])
             put_on.append(_seconds_each(stored[:1], lambda view: rerenderer.fpv(Pose(*view.pose))))
             put_on[-1] -= _seconds_each(stored[:1], lambda view: rerenderer.fpv(Pose(*view.pose)))
         rendered[name].append(_seconds_each(stored, rerender, name in textures, rerenderer, setting.camera, rng))
