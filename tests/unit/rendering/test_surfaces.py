@@ -34,7 +34,7 @@ def plain(color: tuple[int, ...]) -> bytes:
 
 
 def photo(glb: GlbFile, path: Path, lit: bool = False) -> np.ndarray:
-    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(path / "a.glb"))[1], unlit=not lit)
+    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(path / "a.glb")), unlit=not lit)
     return Photographer(scene, CAMERA).take(EYE).astype(int)
 
 
@@ -160,9 +160,9 @@ def test_materials_survive_writing(tmp_path: Path) -> None:
     glb.place(glb.quad(pane(3), UV, glass, COLOR_0=tint))
     mask = glb.material(plain((20, 60, 220, 100)), alphaMode="MASK", alphaCutoff=0.2)
     glb.place(glb.quad(pane(4, 1.0), UV, mask))
-    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(tmp_path / "a.glb"))[1])
+    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(tmp_path / "a.glb")))
     write_scene(tmp_path / "00001-Test", scene)
-    back = replace(scene, photograph=read_glb(tmp_path / "00001-Test/Test.glb")[1])
+    back = replace(scene, photograph=read_glb(tmp_path / "00001-Test/Test.glb"))
     before, after = (Photographer(one, CAMERA).take(EYE).astype(int) for one in (scene, back))
     assert np.abs(before - after).max() <= 4
     assert before.std() > 10

@@ -67,11 +67,16 @@ def scene() -> Scene:
     )
 
 
-def edit_glb(path: Path, edit: Callable[[dict, bytearray], None]) -> None:
-    """Change the JSON header and the binary chunk of a GLB file in place."""
+def chunks(path: Path) -> tuple[dict, bytearray]:
+    """The JSON header and the binary chunk of a GLB file, read without the code under test."""
     content = path.read_bytes()
     size = struct.unpack_from("<I", content, 12)[0]
-    header, binary = json.loads(content[20 : 20 + size]), bytearray(content[28 + size :])
+    return json.loads(content[20 : 20 + size]), bytearray(content[28 + size :])
+
+
+def edit_glb(path: Path, edit: Callable[[dict, bytearray], None]) -> None:
+    """Change the JSON header and the binary chunk of a GLB file in place."""
+    header, binary = chunks(path)
     edit(header, binary)
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
@@ -81,14 +86,13 @@ def edit_glb(path: Path, edit: Callable[[dict, bytearray], None]) -> None:
 
 def vertex_colors(path: Path) -> np.ndarray:
     """(V, 4) uint16 `COLOR_0` of all meshes of a GLB file, read without the code under test."""
-    content = path.read_bytes()
-    size = struct.unpack_from("<I", content, 12)[0]
-    header, colors = json.loads(content[20 : 20 + size]), []
+    header, binary = chunks(path)
+    colors = []
     for mesh in header["meshes"]:
         accessor = header["accessors"][mesh["primitives"][0]["attributes"]["COLOR_0"]]
         assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)
-        start = 28 + size + header["bufferViews"][accessor["bufferView"]]["byteOffset"]
-        colors.append(np.frombuffer(content, "<u2", 4 * accessor["count"], start).reshape(-1, 4))
+        start = header["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        colors.append(np.frombuffer(binary, "<u2", 4 * accessor["count"], start).reshape(-1, 4))
     return np.concatenate(colors)
 
 
@@ -120,7 +124,7 @@ def test_a_scene_comes_back_as_it_was(scene: Scene, tmp_path: Path, unlit: bool,
 def test_files_follow_the_format(scene: Scene, tmp_path: Path) -> None:
     write_scene(tmp_path / scene.name, scene)
     path = tmp_path / scene.name / "Test.semantic.glb"
-    header, annotation = read_glb(path)
+    header, annotation = chunks(path)[0], read_glb(path)
     assert header["samplers"] == [{"magFilter": 9728, "minFilter": 9728, "wrapS": 33071, "wrapT": 33071}]
     assert all(texture["sampler"] == 0 for texture in header["textures"])
     assert all("KHR_materials_unlit" in material["extensions"] for material in header["materials"])
@@ -309,9 +313,9 @@ def test_a_damaged_photograph_is_named(scene: Scene, tmp_path: Path) -> None:
     [
         (lambda content: b"", "found 0 bytes"),
         (lambda content: b"<html>not a home at all</html>", "start with b'<htm'"),
-        (lambda content: content[:-1], r"expected \d+ bytes, as its header says, found \d+"),
-        (lambda content: content[:30], r"expected \d+ bytes, as its header says, found 30"),
-        (lambda content: content + b"\0", r"expected \d+ bytes, as its header says, found \d+"),
+        (lambda content: content[:-1], r"expected \d+ bytes, by its header, found \d+"),
+        (lambda content: content[:30], r"expected \d+ bytes, by its header, found 30"),
+        (lambda content: content + b"\0", r"expected \d+ bytes, by its header, found \d+"),
         (lambda content: content[:4] + b"\1" + content[5:], "found version 1"),
         (lambda content: content[:20] + b"]" + content[21:], "JSON"),
         (None, "No such file"),

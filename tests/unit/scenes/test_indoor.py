@@ -216,9 +216,9 @@ def test_rooms_are_as_full_as_real_ones(homes):
     assert 6 < found.rooms / found.scenes < 9
     assert found.walls == pytest.approx(HM3DSEM.walls, rel=0.2)
     assert found.objects_median == pytest.approx(HM3DSEM.objects_median, rel=0.2)
-    assert found.share["wall"] == found.share["floor"] == 1
-    for label, share in HM3DSEM.share.items():
-        assert found.share[label] == pytest.approx(share, abs=0.2 * share + 0.03), label
+    assert found.fraction["wall"] == found.fraction["floor"] == 1
+    for label, fraction in HM3DSEM.fraction.items():
+        assert found.fraction[label] == pytest.approx(fraction, abs=0.2 * fraction + 0.03), label
     for (kind, label), mean in HM3DSEM.mean.items():
         assert found.mean[kind, label] == pytest.approx(mean, abs=mean / 3 + 0.15), f"{label} in {kind}"
 

@@ -30,7 +30,7 @@ def test_known_counts():
     assert found.objects_median == 7
     assert found.walls == pytest.approx(2)
     expected = {"wall": 3, "floor": 3, "chair": 2, "sofa": 0, "bed": 2, "plant": 1, "toilet": 1, "tv": 1}
-    assert found.share == pytest.approx({label: count / 3 for label, count in expected.items()})
+    assert found.fraction == pytest.approx({label: count / 3 for label, count in expected.items()})
     assert {key: mean for key, mean in found.mean.items() if mean and key[1] not in ("wall", "floor")} == {
         ("bedroom", "chair"): 1.5, ("bedroom", "bed"): 1.0, ("bedroom", "plant"): 1.5, ("bedroom", "tv"): 0.5,
         ("bathroom", "toilet"): 1.0,
@@ -52,7 +52,7 @@ def test_one_table_names_every_number():
 
 def test_what_belongs_to_no_room_is_left_out():
     outside = scene("sofa, wall", first_region=-1)
-    assert home_statistics([*SCENES, outside]).share == home_statistics(SCENES).share
+    assert home_statistics([*SCENES, outside]).fraction == home_statistics(SCENES).fraction
     assert home_statistics([*SCENES, outside]).scenes == 3
     with pytest.raises(InputError, match="none in 1 scenes"):
         home_statistics([outside])
