@@ -92,7 +92,7 @@ def opened_structures(
     """The first half of `synth_texture`: (rows, cols) bool, white from `opened_fraction` to 10 % (relative) above.
 
     A source adds at most the area of four of the largest kernels, so that many sources contribute. Larger connected
-    structures, most of them from almost white masks, are left out.
+    structures, mainly from almost white masks, are left out.
     """
     texture = np.zeros(shape, bool)
     target = config.opened_fraction * texture.size
@@ -129,11 +129,11 @@ def _opened_source(
     if np.count_nonzero(mask) > mask.size / 2:
         mask = ~mask
     mask[[0, -1]] = mask[:, [0, -1]] = False  # `opening` wraps around: no kernel may fit across the border
-    return opening(mask, _random_kernel(config.kernel_px, rng))
+    return opening(mask, kernel_runs(*_random_kernel(config.kernel_px, rng)))
 
 
-def _random_kernel(kernel_px: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    return kernel_runs(KERNELS[rng.integers(len(KERNELS))], int(rng.integers(kernel_px[0], kernel_px[1] + 1)))
+def _random_kernel(kernel_px: tuple[int, int], rng: np.random.Generator) -> tuple[str, int]:
+    return KERNELS[rng.integers(len(KERNELS))], int(rng.integers(kernel_px[0], kernel_px[1] + 1))
 
 
 def _dilated_until(
@@ -145,8 +145,7 @@ def _dilated_until(
     from the ring that the next size adds, from a random texel on, row by row.
     """
     while np.count_nonzero(mask) < white:
-        shape = KERNELS[rng.integers(len(KERNELS))]
-        size = int(rng.integers(kernel_px[0], kernel_px[1] + 1))
+        shape, size = _random_kernel(kernel_px, rng)
         dilated = dilate(mask, kernel_runs(shape, size), wrap)
         if np.count_nonzero(dilated) <= white:
             mask = dilated
@@ -179,7 +178,7 @@ def modsem_textures(
     - Instances erode separately: a line one texel wide is black between two that touch, and so is all beyond the
       chart. Without it a densely packed chart is uniformly white, without a trace of its objects.
     Kernels are in texels: if the density of an atlas varies, as in scans, coarse parts lose wider margins in metres.
-    Draws differ in the margins only, and little if the fraction is high.
+    Draws differ in the margins only; some are equal.
     """
     covered = instance_image > 0
     white = covered.copy()

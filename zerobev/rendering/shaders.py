@@ -61,7 +61,7 @@ void main() {
 
 
 class SurfaceRenderer(Renderer):
-    """pyrender's renderer, without fragments whose alpha is below their material's `alphaCutoff`.
+    """pyrender's renderer, without fragments with alpha below their material's `alphaCutoff`.
 
     With the flag FLAT a fragment is the product of texture, base colour and vertex colour in linear light.
     """

@@ -44,7 +44,7 @@ class Charts:
         self._face_chart.append(self._keys[key])
 
     def build(self, corners: np.ndarray) -> dict[str, np.ndarray | tuple[np.ndarray, ...]]:
-        """The fields `face_uv`, `face_chart` and `chart_instance` of a scene whose faces have `corners` (F, 3, 3).
+        """The fields `face_uv`, `face_chart` and `chart_instance` of a scene; `corners` (F, 3, 3) are its faces'.
 
         Charts are in the order of their first face. A texture that repeats over a face is repeated in its chart.
         Colours of no instance on more than 5 % of the surface are an `InputError`; black means "unknown".

@@ -40,7 +40,6 @@ class SceneFolders:
     train: tuple[Path, ...]
     validation: tuple[Path, ...]
     test: tuple[Path, ...]
-    dealt: bool = False  #: not the official split, because it has too few scenes
 
     def of(self, split: Split) -> tuple[Path, ...]:
         """The folders of one split."""
@@ -87,15 +86,15 @@ def split_scenes(root: Path) -> SceneFolders:
     names = {folder.name for folder in validation}
     test = [folder for folder in found["val"] if folder.name not in names]
     if found["train"] and validation and test:
-        return SceneFolders(tuple(found["train"]), tuple(validation), tuple(test), dealt=False)
+        return SceneFolders(tuple(found["train"]), tuple(validation), tuple(test))
     by_name = {folder.name: folder for split in _SPLITS for folder in found[split]}
     scenes = tuple(by_name[name] for name in sorted(by_name))
     if len(scenes) < 2:
-        raise InputError(f"{root}: expected two annotated scenes at least, for training and for test, found one")
+        raise InputError(f"{root}: expected at least two annotated scenes, for training and for test, found one")
     tests = max(1, len(scenes) // 5)
     if len(scenes) == 2:
-        return SceneFolders(scenes[:1], scenes[:1], scenes[1:], dealt=True)
-    return SceneFolders(scenes[: -tests - 1], scenes[-tests - 1 : -tests], scenes[-tests:], dealt=True)
+        return SceneFolders(scenes[:1], scenes[:1], scenes[1:])
+    return SceneFolders(scenes[: -tests - 1], scenes[-tests - 1 : -tests], scenes[-tests:])
 
 
 def read_scene(folder: Path) -> Scene:
@@ -107,7 +106,7 @@ def read_scene(folder: Path) -> Scene:
     """
     folder = Path(folder)
     stem = hash_of(folder)
-    instances, bad_rows = _read_rows(folder / f"{stem}.semantic.txt")
+    instances, bad_rows = read_instances(folder / f"{stem}.semantic.txt")
     path = folder / f"{stem}.semantic.glb"
     annotation = read_glb(path)
     atlas = _read_atlas(path, annotation, instances, bad_rows)
@@ -123,8 +122,8 @@ def read_scene(folder: Path) -> Scene:
     return scene
 
 
-def read_instances(path: Path) -> tuple[Instance, ...]:
-    """The rows of a `.semantic.txt`, sorted by id, with the labels of their names.
+def read_instances(path: Path) -> tuple[tuple[Instance, ...], int]:
+    """The rows of a `.semantic.txt`, sorted by id, with the labels of their names; and the number of left-out rows.
 
     The first line is `HM3D Semantic Annotations`, each further line `id,RRGGBB,"name",region`; names may contain commas
     and quotes. Ids are 1 to 65535; ids and colours are unique, and black means "unknown".
@@ -133,11 +132,6 @@ def read_instances(path: Path) -> tuple[Instance, ...]:
     out. Their surfaces have id 0, "unknown". One warning on the log "zerobev.scenes" lists them. A file without a good
     row, without the first line, or that cannot be read, is an `InputError`.
     """
-    return _read_rows(Path(path))[0]
-
-
-def _read_rows(path: Path) -> tuple[tuple[Instance, ...], int]:
-    """As `read_instances`, with the number of left-out rows."""
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
     except OSError as error:
