@@ -189,7 +189,7 @@ DAMAGES = {
     "bit": (flip_a_bit, 1, "expected SHA-256 .*, found "),
     "cut": (truncate, 1, "expected SHA-256 .*, found "),
     "missing": (Path.unlink, 1, "expected a shard, found nothing"),
-    "foreign": (lambda shard: shard.with_name("a.h5").write_bytes(b""), 1, "a.h5: .*found one that it does not"),
+    "foreign": (lambda shard: shard.with_name("a.h5").write_bytes(b""), 1, "a.h5: .*found another one"),
     "sums": (exchange, 2, "expected SHA-256 .*, found "),
     "seed": (lambda shard: rewrite(shard, seed=9), 2, "expected 3 views with seed 9, found 3 with seed 5"),
     "views": (lambda shard: rewrite(shard, views=4), 2, "expected 4 views with seed 5, found 3"),
@@ -268,7 +268,7 @@ def test_killed_run_is_resumed_without_repetition(homes, tmp_path, monkeypatch):
     unbroken, out, log = tmp_path / "unbroken", tmp_path / "out", tmp_path / "log"
     options = ["--scenes", str(homes), "--scale", "smoke", "--views", "25", "--out"]
     call(*options, unbroken)
-    again = [sys.executable, "-m", "zerobev.data.generate", *options, str(out), "--workers", "2"]
+    again = [sys.executable, "-m", "zerobev", "generate", *options, str(out), "--workers", "2"]
     killed = subprocess.Popen(again, cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
     while len(there := list(out.glob("train/[!.]*.h5"))) < 2:
         assert killed.poll() is None

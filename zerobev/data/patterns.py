@@ -261,11 +261,11 @@ def procedural(kind: str, rng: Rng, size: int) -> Array:
 
 
 def read_grey(path: Path) -> Array:
-    """Read an image file as (h, w) float32 in [0, 1]; a damaged file or one of another kind is an `InputError`."""
+    """Read a PNG or JPEG file as (h, w) float32 in [0, 1]; a damaged file or one of another kind is an `InputError`."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=("PNG", "JPEG")) as image:
             return np.asarray(image.convert("L"), np.float32) / 255
-    except (OSError, SyntaxError, ValueError) as error:
+    except Exception as error:  # PIL raises many kinds of error for a damaged image
         raise InputError(f"{path}: expected an image, found {error}") from error
 
 
