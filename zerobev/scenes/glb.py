@@ -149,10 +149,10 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
             continue  # readers such as trimesh would use the material's white
         texture = None
         if primitive.image is not None:
-            key = id(primitive.image), primitive.wrap
-            if key not in texture_of:
-                texture_of[key] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
-            texture = texture_of[key]
+            sampled = id(primitive.image), primitive.wrap
+            if sampled not in texture_of:
+                texture_of[sampled] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
+            texture = texture_of[sampled]
         triangles["material"] = len(header["materials"])
         header["materials"].append(_material(primitive, texture))
     header["buffers"] = [{"byteLength": len(binary)}]
