@@ -30,7 +30,7 @@ def _setup_error(error: Exception) -> SetupError:
     found = f"{platform} with {type(error).__name__}: {' '.join(str(error).split())}"
     remedy = f"install {_PACKAGES[platform]} (Debian's packages)"
     if platform == "egl" and device is not None:
-        remedy = f"set EGL_DEVICE_ID to a device that is there, or to none (found {device!r}), or {remedy}"
+        remedy = f"set EGL_DEVICE_ID to an existing device, or to none (found {device!r}), or {remedy}"
     if platform == "osmesa":
         remedy += ", or set PYOPENGL_PLATFORM=egl"
     return SetupError(f"{expected}, found {found}; {remedy}")

@@ -124,14 +124,14 @@ def _textured_primitives(parts: list[_Textured]) -> list[pyrender.Primitive]:
         images = {key: np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge") for key, image in images.items()}
     frame = int(len(images) > 1)
     found = []
-    for places in _shelves({key: image.shape[:2] for key, image in images.items()}):
-        rows, columns = (max(places[key][k] + images[key].shape[k] for key in places) for k in (0, 1))
+    for positions in _shelves({key: image.shape[:2] for key, image in images.items()}):
+        rows, columns = (max(positions[key][k] + images[key].shape[k] for key in positions) for k in (0, 1))
         atlas = np.zeros((rows, columns, 4), np.uint8)
-        for key, (row, column) in places.items():
+        for key, (row, column) in positions.items():
             atlas[row : row + images[key].shape[0], column : column + images[key].shape[1]] = images[key]
-        here = [part for part in parts if id(part.image) in places]
+        here = [part for part in parts if id(part.image) in positions]
         corners = np.concatenate([part.corners for part in here])
-        uv_px = [part.uv * part.image.size + np.add(places[id(part.image)], frame)[::-1] for part in here]
+        uv_px = [part.uv * part.image.size + np.add(positions[id(part.image)], frame)[::-1] for part in here]
         uv = np.concatenate(uv_px) / (columns, rows) * (1, -1) + (0, 1)  # OpenGL's v runs up
         tint = None
         if any(part.tint is not None for part in here):
