@@ -1,4 +1,4 @@
-"""Whatever a file or an argument holds, a parser gives a result or an `InputError`: no other error, no hang, no flood.
+"""For any file or argument a parser returns a result or raises `InputError`, within bounds of time and memory.
 
 Some 13,400 inputs: valid ones with bytes flipped, cut short, or with a field of their JSON replaced, and ones that are
 odd from the start. Every input has 20 s, and memory for 3 GiB more than the process has.
@@ -38,7 +38,7 @@ from support.records import run_record
 from support.scenes import box, build, room
 
 _SECONDS, _BYTES = 20, 3 << 30
-#: What a field of JSON is replaced by.
+#: Replacements of a JSON field.
 ODD = [None, True, -1, 0, 1, 2, 3, 4, 5, 255, 65536, 2**31, 2**63, 10**30, 0.5, 1e308, float("nan"), float("inf")]
 ODD += ["", "x", "SCALAR", "VEC2", "VEC4", "MAT4", 5120, 5121, 5122, 5123, 5125, 5126, [], [0], [[]], [None], {}]
 ODD += [
@@ -57,7 +57,7 @@ class Hang(BaseException):
 
 @pytest.fixture(autouse=True)
 def bounded() -> Iterator[None]:
-    """Bounds on time and on memory, for the length of a test."""
+    """Limit time and memory during a test."""
 
     def stop(*_: object) -> None:
         raise Hang
@@ -72,7 +72,7 @@ def bounded() -> Iterator[None]:
 
 
 def fuzz(make: Callable[[Random], Any], examples: int, parse: Callable[[Any], Any]) -> Counter[str]:
-    """How many inputs were read, and how many refused, in one line and not for lack of memory.
+    """Numbers of inputs that were read, and refused in one line and not for lack of memory.
 
     Hypothesis draws the seed of an input alone: that is a hundred times faster than to draw every byte.
     """
@@ -100,7 +100,7 @@ def fuzz(make: Callable[[Random], Any], examples: int, parse: Callable[[Any], An
     return seen
 
 
-# --- how inputs are spoilt -----------------------------------------------------------------------------------------
+# --- damage to inputs -----------------------------------------------------------------------------------------------
 
 
 def flipped(rng: Random, content: bytes, among: int | None = None) -> bytes:
@@ -116,7 +116,7 @@ def cut(rng: Random, content: bytes) -> bytes:
 
 
 def paths(value: Any, path: tuple = ()) -> Iterator[tuple]:
-    """Where every field of a JSON value is."""
+    """The paths of all fields of a JSON value."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, entry in items:
         yield (*path, name)
@@ -124,7 +124,7 @@ def paths(value: Any, path: tuple = ()) -> Iterator[tuple]:
 
 
 def edited(rng: Random, value: Any) -> Any:
-    """JSON with a field or two replaced or taken away."""
+    """JSON with one or two fields replaced or removed."""
     value = copy.deepcopy(value)
     for _ in range(rng.randint(1, 2)):
         *path, name = rng.choice(list(paths(value)) or [(None,)])
@@ -157,7 +157,7 @@ def any_text(rng: Random, most: int) -> str:
 
 
 def any_list(rng: Random) -> bytes:
-    """A list of instances; every part of it is good for the most part."""
+    """A list of instances with mostly valid parts."""
 
     def odd(good: str, most: int = 8) -> str:
         return any_text(rng, most) if rng.random() < 0.1 else good
@@ -177,7 +177,7 @@ def test_lists_of_instances(tmp_path: Path) -> None:
 
     def parse(content: bytes) -> None:
         path.write_bytes(content)
-        found = read_instances(path)
+        found, _ = read_instances(path)
         assert [i.id for i in found] == sorted({i.id for i in found})
         assert len({i.color for i in found} - {(0, 0, 0)}) == len(found)
 
@@ -197,7 +197,7 @@ NAMES = ("AAAAAAAAAAA.glb", "AAAAAAAAAAA.semantic.glb")
 
 @contextmanager
 def changed(folder: Path, name: str) -> Iterator[tuple[bytes, Callable[[bytes], None]]]:
-    """A file of a scene, and a function that reads the scene with other bytes in its place."""
+    """A file of a scene, and a function that reads the scene with other bytes in that file."""
     whole = (folder / name).read_bytes()
 
     def parse(content: bytes) -> None:
@@ -225,7 +225,7 @@ def with_header(whole: bytes, edit: Callable[[dict], Any]) -> bytes:
 @pytest.mark.parametrize("name", NAMES)
 def test_bytes_of_glb_files(home: Path, name: str) -> None:
     def make(rng: Random, whole: bytes) -> bytes:
-        # the first bytes hold lengths and the header, where most damage can be done
+        # the first bytes hold lengths and the header, the most sensitive part
         return rng.choice((flipped(rng, whole), flipped(rng, whole, 4000), cut(rng, whole), rng.randbytes(40)))
 
     with changed(home, name) as (whole, parse):
@@ -242,7 +242,7 @@ def test_headers_of_glb_files(home: Path, name: str) -> None:
 
 @pytest.fixture(scope="module")
 def rich_home(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A home whose files have everything that is read of glTF: its texture repeats, glass stands before it."""
+    """A home with all supported features of glTF, among them a repeated texture and glass."""
     folder = tmp_path_factory.mktemp("rich") / home.name
     shutil.copytree(home, folder)
     color = [int(pair, 16) for pair in ("5D", "7F", "33")]
@@ -272,7 +272,7 @@ def rich_home(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_everything_that_is_read_of_gltf(rich_home: Path, name: str) -> None:
+def test_all_supported_features_of_gltf(rich_home: Path, name: str) -> None:
     """Accessors, samplers, materials, instances and nodes with odd fields: read, or refused in one line."""
     with changed(rich_home, name) as (whole, parse):
         parse(whole)
@@ -302,7 +302,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize("what", IMPOSSIBLE)
-def test_headers_that_ask_for_the_impossible(home: Path, what: str) -> None:
+def test_headers_with_impossible_values(home: Path, what: str) -> None:
     def edit(header: dict) -> dict:
         IMPOSSIBLE[what](header)
         return header
@@ -313,7 +313,7 @@ def test_headers_that_ask_for_the_impossible(home: Path, what: str) -> None:
 
 
 def test_textures_that_no_reader_should_open(home: Path) -> None:
-    """PostScript, which is a program; and sides beyond what texels are counted with."""
+    """PostScript, which is a program, and sides beyond the type of texel indices."""
 
     def file(image: Image.Image, kind: str) -> bytes:
         stream = io.BytesIO()
@@ -397,7 +397,7 @@ _FILLS = [0, 1, 0.5, -1, 2, 255, 1e-30, 1e30, float("nan"), float("inf"), -float
 
 
 def odd_array(rng: Random) -> np.ndarray:
-    """An array of any type and of few shapes, with values out of every range."""
+    """An array of any type and of few shapes, with values of all magnitudes."""
     with np.errstate(all="ignore"):
         array = np.zeros(rng.choice(_SHAPES), rng.choice(_TYPES))
         if array.dtype.kind in "biufcg" and array.size:
@@ -450,7 +450,7 @@ _NAMES = [["a"], ["a", "b"], {0: "a", 1: "b"}, "ab", {}, {1}, 7, (None, None), [
 
 
 def numbers(rng: Random, columns: int) -> Any:
-    """Points or boxes, odd ones too."""
+    """Points or boxes, including invalid ones."""
     if rng.random() < 0.1:
         return rng.choice(_NOTHING)
     rows = range(rng.randrange(1, 4))
@@ -490,17 +490,17 @@ def test_arguments_of_project(projector: zerobev.Projector) -> None:
     assert seen["read"] > 50 and seen["refused"] > 1000
 
 
-def test_valid_arguments_of_project_are_taken(projector: zerobev.Projector) -> None:
+def test_valid_arguments_of_project_are_accepted(projector: zerobev.Projector) -> None:
     images = [_RGB, _RGB / 255, (_RGB / 255).astype(np.float16), (_RGB / 255).tolist(), np.asfortranarray(_RGB)]
     modalities = [_MASKS, _MASKS[0], _MASKS[0] + 1, _MASKS * 0.5, _MASKS.astype(">f4"), _MASKS[0].tolist()]
     modalities += [zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]), zerobev.Flow([[1, 1]], [[1e300, 2]])]
     for image, modality in zip(images * 2, modalities):
         projector.project(image, modality, np.float32(66))
     wide = next(iter(zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]).images((8, 8)).images))
-    assert wide[:4].all() and not wide[4:].any()  # a box that ends far outside covers all up to the border
+    assert wide[:4].all() and not wide[4:].any()  # a box that ends far outside covers all pixels up to the border
 
 
-def test_more_images_than_fit_are_refused(projector: zerobev.Projector) -> None:
+def test_too_many_images_are_refused(projector: zerobev.Projector) -> None:
     dot = np.ones((1, 1, 3), np.uint8)
     with pytest.raises(InputError, match=f"expected {MAX_IMAGES} binary images at most, found {MAX_IMAGES + 1}"):
         projector.project(dot, np.ones((MAX_IMAGES + 1, 1, 1), bool))

@@ -1,7 +1,7 @@
-"""Whatever an image file or an array holds, reading it gives a result or an `InputError` of one line.
+"""For any image file or array, the reader returns a result or raises an `InputError` of one line.
 
-Every mode of Pillow in every format that takes it, with orientation, transparency and frames, cut short and with bytes
-replaced; and modalities of every kind, type and shape.
+Every mode of Pillow in every format that supports it, with orientation, transparency and frames, truncated and with
+bytes replaced; and modalities of every kind, type and shape.
 """
 
 import io
@@ -28,7 +28,7 @@ SHAPE = (7, 9)
 
 
 def fuzz(examples: int, make: Callable[[Random], object], parse: Callable[[object], object]) -> Counter[str]:
-    """How many inputs were taken, and how many refused in one line."""
+    """Numbers of inputs that were accepted, and refused in one line."""
     seen: Counter[str] = Counter()
 
     @settings(max_examples=examples)
@@ -38,7 +38,7 @@ def fuzz(examples: int, make: Callable[[Random], object], parse: Callable[[objec
         value = make(rng)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # Pillow's, of damaged metadata
+                warnings.simplefilter("ignore")  # Pillow's warnings about damaged metadata
                 parse(value)
             seen["taken"] += 1
         except InputError as error:
@@ -66,13 +66,13 @@ def any_image(rng: Random) -> Image.Image:
 
 
 def any_file(rng: Random) -> bytes:
-    """A file of such an image, perhaps damaged."""
+    """A file of such an image, possibly damaged."""
     image, stream, exif = any_image(rng), io.BytesIO(), Image.Exif()
     exif[0x0112] = rng.choice((1, 1, 3, 5, 6, 8, 9, 0))
     kind = rng.choice(KINDS)
     options = (
         {"exif": exif} if kind != "AVIF" and rng.random() < 0.5 else {}
-    )  # Pillow's writer of AVIF dies of odd ones
+    )  # Pillow's AVIF writer crashes on some EXIF data
     if rng.random() < 0.1:
         options |= {"save_all": True, "append_images": [any_image(rng)]}
     if rng.random() < 0.1:

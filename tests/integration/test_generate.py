@@ -1,4 +1,4 @@
-"""Generation: the same bytes whoever works, nothing redone, nothing damaged that goes unnoticed."""
+"""Generation: the same bytes for any workers, no repeated work, and detection of damage."""
 
 import gc
 import json
@@ -58,7 +58,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-def test_manifest_says_what_was_recorded_and_how(recorded):
+def test_contents_of_the_manifest(recorded):
     manifest = json.loads((recorded / "manifest.json").read_text())
     names = ["00001-AAAAAAAAAAA.h5", "00002-BBBBBBBBBBB.h5"]
     assert {name: entry["sha256"] for name, entry in manifest.pop("shards").items()} == {
@@ -87,7 +87,7 @@ def test_a_scene_does_not_depend_on_the_others(folders, recorded, tmp_path):
     assert (tmp_path / name).read_bytes() == (recorded / name).read_bytes()
 
 
-def test_scenes_that_are_alike_are_seen_from_other_poses(folders, tmp_path):
+def test_equal_scenes_have_different_poses(folders, tmp_path):
     twin = tmp_path / "00009-AAAAAAAAAAA"
     twin.symlink_to(folders[0])
     generate([folders[0], twin], tmp_path / "out", VIEWS, CAMERA, TEXTURE, SEED)
@@ -95,7 +95,7 @@ def test_scenes_that_are_alike_are_seen_from_other_poses(folders, tmp_path):
     assert np.abs(first.view(0).pose - second.view(0).pose).max() > 0.01
 
 
-def test_resumed_run_redoes_nothing_and_equals_an_unbroken_one(folders, recorded, tmp_path, monkeypatch):
+def test_resumed_run_repeats_nothing_and_equals_an_uninterrupted_one(folders, recorded, tmp_path, monkeypatch):
     def killed(folder, *args):
         if folder == folders[1]:
             raise KeyboardInterrupt
@@ -112,7 +112,7 @@ def test_resumed_run_redoes_nothing_and_equals_an_unbroken_one(folders, recorded
     assert generate(folders, tmp_path, VIEWS, CAMERA, TEXTURE, SEED) == {}
     assert contents(tmp_path) == contents(recorded)
     assert (first.stat().st_mtime_ns, first.stat().st_ino) == (written.st_mtime_ns, written.st_ino)
-    assert generate(folders, tmp_path, VIEWS, CAMERA, TEXTURE, SEED) == {}  # nothing is left to do
+    assert generate(folders, tmp_path, VIEWS, CAMERA, TEXTURE, SEED) == {}  # complete
 
 
 OTHER_RUNS = [
@@ -124,7 +124,7 @@ OTHER_RUNS = [
 
 
 @pytest.mark.parametrize("run", OTHER_RUNS)
-def test_shards_of_another_run_are_not_taken_for_this_one(folders, recorded, tmp_path, run):
+def test_shards_of_another_run_are_refused(folders, recorded, tmp_path, run):
     before = contents(recorded)
     with pytest.raises(InputError, match=r"manifest\.json: expected a manifest of .*, found one of "):
         generate(folders, recorded, *run)
@@ -143,8 +143,8 @@ def meshes_alive() -> int:
     return sum(type(thing) is trimesh.Scene for thing in gc.get_objects())
 
 
-def test_scenes_do_not_pile_up_in_a_worker(folders, tmp_path):
-    """Meshes refer to themselves, and hold the images of their textures."""
+def test_a_worker_frees_its_scenes(folders, tmp_path):
+    """Meshes have reference cycles, and hold the images of their textures."""
     gc.collect()
     before = meshes_alive()
     gc.disable()
@@ -155,7 +155,7 @@ def test_scenes_do_not_pile_up_in_a_worker(folders, tmp_path):
         gc.enable()
 
 
-def test_a_part_of_the_scenes_leaves_the_others_in_the_manifest(folders, recorded, tmp_path):
+def test_generating_some_scenes_leaves_the_others_in_the_manifest(folders, recorded, tmp_path):
     for part in (folders[1:], folders[:1], folders[1:]):
         assert generate(part, tmp_path, VIEWS, CAMERA, TEXTURE, SEED) == {}
     assert contents(tmp_path) == contents(recorded)
@@ -172,7 +172,7 @@ def truncate(shard: Path) -> None:
 
 
 def exchange(shard: Path) -> None:
-    """The manifest, with the sums of two shards exchanged."""
+    """The manifest, with the checksums of two shards exchanged."""
     path = shard.with_name("manifest.json")
     manifest = json.loads(path.read_text())
     first, second = manifest["shards"].values()
@@ -189,7 +189,7 @@ DAMAGES = {
     "bit": (flip_a_bit, 1, "expected SHA-256 .*, found "),
     "cut": (truncate, 1, "expected SHA-256 .*, found "),
     "missing": (Path.unlink, 1, "expected a shard, found nothing"),
-    "foreign": (lambda shard: shard.with_name("a.h5").write_bytes(b""), 1, "a.h5: .*found one that it does not"),
+    "foreign": (lambda shard: shard.with_name("a.h5").write_bytes(b""), 1, "a.h5: .*found another one"),
     "sums": (exchange, 2, "expected SHA-256 .*, found "),
     "seed": (lambda shard: rewrite(shard, seed=9), 2, "expected 3 views with seed 9, found 3 with seed 5"),
     "views": (lambda shard: rewrite(shard, views=4), 2, "expected 4 views with seed 5, found 3"),
@@ -211,7 +211,7 @@ def test_verify_finds(damage, recorded, tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"camera": {}}', '{"camera": 3, "shards": {}}'])
-def test_manifest_that_is_none(content, folders, recorded, tmp_path):
+def test_invalid_manifests(content, folders, recorded, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(recorded, out)
     (out / "manifest.json").unlink()
@@ -221,11 +221,11 @@ def test_manifest_that_is_none(content, folders, recorded, tmp_path):
         verify(out)
 
 
-def test_a_damaged_shard_is_not_listed_anew(folders, recorded, tmp_path):
+def test_a_damaged_shard_does_not_change_the_manifest(folders, recorded, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(recorded, out)
     with h5py.File(out / f"{folders[1].name}.h5", "r+") as file:
-        file["instance_label"][0] = 7  # as whole as before, to HDF5
+        file["instance_label"][0] = 7  # valid HDF5
     manifest = (out / "manifest.json").read_bytes()
     problems = generate(folders, out, VIEWS, CAMERA, TEXTURE, SEED)
     assert list(problems) == [folders[1].name] and "expected SHA-256" in problems[folders[1].name]
@@ -264,27 +264,27 @@ def call(*arguments: object) -> None:
     cli.main(["generate", *map(str, arguments)])
 
 
-def test_killed_run_goes_on_and_redoes_nothing(homes, tmp_path, monkeypatch):
+def test_killed_run_is_resumed_without_repetition(homes, tmp_path, monkeypatch):
     unbroken, out, log = tmp_path / "unbroken", tmp_path / "out", tmp_path / "log"
     options = ["--scenes", str(homes), "--scale", "smoke", "--views", "25", "--out"]
     call(*options, unbroken)
-    again = [sys.executable, "-m", "zerobev.data.generate", *options, str(out), "--workers", "2"]
+    again = [sys.executable, "-m", "zerobev", "generate", *options, str(out), "--workers", "2"]
     killed = subprocess.Popen(again, cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
     while len(there := list(out.glob("train/[!.]*.h5"))) < 2:
         assert killed.poll() is None
         time.sleep(0.01)
-    os.killpg(killed.pid, signal.SIGKILL)  # the workers are of the group too
+    os.killpg(killed.pid, signal.SIGKILL)  # including the workers
     killed.wait()
     there = list(out.glob("train/[!.]*.h5"))
     assert 2 <= len(there) < 5 and not list(out.rglob("manifest.json"))
-    (out / "train/.00004-AAAAAAAAAAA.1.part.h5").write_bytes(b"half")  # what a kill in the middle of it leaves
+    (out / "train/.00004-AAAAAAAAAAA.1.part.h5").write_bytes(b"half")  # as left by a kill
     finished = {path: path.stat() for path in there}
     subprocess.run(again, cwd=ROOT, check=True, env={**os.environ, "ZEROBEV_PROGRESS": str(log)}, timeout=300)
     for path, before in finished.items():
         assert (path.stat().st_mtime_ns, path.stat().st_ino) == (before.st_mtime_ns, before.st_ino)
     for part in ("train", "validation", "test"):
         assert contents(out / part) == contents(unbroken / part)
-    # how many are done of those that were missing, and the time that is left
+    # number of recorded shards of those missing, and the remaining time
     assert re.search(rf"views of train: 100%.*{5 - len(there)}/{5 - len(there)} \[\d+:\d+<\d+:\d+", log.read_text())
 
 
@@ -294,7 +294,7 @@ def test_a_dask_cluster_writes_the_same_bytes(homes, tmp_path, monkeypatch):
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         call(*options, tmp_path / "dask", "--dask", cluster.scheduler_address)
         tasks = cluster.scheduler.transition_counter
-    assert tasks > 0  # it was the cluster that worked
+    assert tasks > 0  # the cluster did the work
     for part in ("train", "validation", "test"):
         assert contents(tmp_path / "dask" / part) == contents(tmp_path / "here" / part)
 
@@ -327,13 +327,13 @@ def test_command_reports_a_broken_scene(homes, folders, tmp_path, monkeypatch):
     ]
 
 
-def test_dask_address_that_is_none(homes, tmp_path, monkeypatch):
+def test_invalid_dask_address(homes, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"^error: --dask: expected the address of a scheduler, found 'nonsense'"):
         call("--scenes", homes, "--out", tmp_path / "out", "--dask", "nonsense")
 
 
 def test_command_records_every_split(folders, tmp_path, monkeypatch, capsys):
-    """Two scenes are dealt out as one for training and validation, and one for test."""
+    """Of two scenes one is for training and validation, and one for test."""
     for split, folder in (("train", folders[0]), ("val", folders[1])):
         (tmp_path / "homes" / split).mkdir(parents=True)
         (tmp_path / "homes" / split / folder.name).symlink_to(folder)

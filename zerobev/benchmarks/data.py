@@ -107,7 +107,7 @@ def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> di
     for _, (name, stream) in itertools.product(range(repeats), streams.items()):
         looked_up[name].append(_seconds_each(stored, stream.pair, 0, rng))
         if name in textures:
-            rerenderer.wear(textures[name])
+            rerenderer.set_texture(textures[name])
             first, again = (_seconds_each(stored[:1], lambda view: rerenderer.fpv(Pose(*view.pose))) for _ in range(2))
             uploads.append(first - again)
         rendered[name].append(_seconds_each(stored, rerender, name in textures, rerenderer, setting.camera, rng))

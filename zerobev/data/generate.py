@@ -1,10 +1,10 @@
 """Record scenes as shards of views.
 
 Reads scenes in HM3DSem layout; writes `train/`, `validation/` and `test/` with a shard per scene and a manifest into
-`--out`. Scenes are spread over processes (`--workers`) or the workers of a dask cluster (`--dask`). A shard depends on
-the scene, the configuration, the number of views and the seed alone: any number of workers writes the same bytes. After
-an interruption the same command goes on, since every shard is written whole. `--verify` checks the shards against the
-manifest.
+`--out`. Scenes are distributed over processes (`--workers`) or the workers of a dask cluster (`--dask`). A shard
+depends only on the scene, the configuration, the number of views and the seed, so its bytes do not depend on the number
+of workers. Shards are written atomically: after an interruption, the same command continues. `--verify` checks the
+shards against the manifest.
 """
 
 import argparse
@@ -32,16 +32,16 @@ _MANIFEST = "manifest.json"
 
 
 def shard_path(scene_folder: Path, out: Path) -> Path:
-    """Where the shard of a scene belongs."""
+    """The path of a scene's shard."""
     return out / f"{scene_folder.name}.h5"
 
 
 def generate_shard(
     scene_folder: Path, out: Path, views: int, camera: CameraConfig, texture: TextureConfig, seed: int
 ) -> Path:
-    """Record `views` views of one scene, unless its shard is there; returns the shard's path.
+    """Record `views` views of one scene unless its shard exists; returns the shard's path.
 
-    Raises `InputError` for a broken scene, and for a shard that is damaged or belongs to another run.
+    Raises `InputError` for a broken scene, and for a shard that is damaged or of another run.
     """
     path = shard_path(scene_folder, out)
     if path.exists():
@@ -49,7 +49,7 @@ def generate_shard(
         return path
     if views < 1:
         raise InputError(f"views: expected 1 or more, found {views}")
-    for unfinished in out.glob(f".{path.stem}.*.part.h5"):  # of a run that was killed
+    for unfinished in out.glob(f".{path.stem}.*.part.h5"):  # left by a killed process
         unfinished.unlink(missing_ok=True)
     scene = read_scene(scene_folder)
     rng = np.random.default_rng(_scene_seed(scene_folder, seed))
@@ -69,24 +69,25 @@ def generate(
 ) -> dict[str, str]:
     """Record every scene into `out` and write `manifest.json` there: configuration, seeds, SHA-256 of each shard.
 
-    `workers` is a number of processes; under `joblib.parallel_config` with another back end, that one decides. A
-    scene that fails, for whatever reason, is skipped; a shard of another run, or one that is not what the manifest
-    lists, is left alone. Returns the failures, scene name -> message; empty when all went well. Raises `InputError`
-    where `out` has a manifest of another run.
+    `workers` is the number of processes, unless `joblib.parallel_config` selects another back end. A scene that fails
+    is skipped; an existing shard of another run, or with another checksum than the manifest's, is a failure and stays.
+    Returns the failures, scene name -> message. Raises `InputError` if `out` has a manifest of another run.
     """
     run = {**recorded_with(camera, texture), "seed": seed, "views": views}
     listed = _listed(out, run)
-    there = [folder for folder in scene_folders if shard_path(folder, out).exists()]
-    missing = [folder for folder in scene_folders if folder not in there]
+    existing = [folder for folder in scene_folders if shard_path(folder, out).exists()]
+    missing = [folder for folder in scene_folders if folder not in existing]
     found: dict[Path, str | InputError] = {}
-    for folders, sums, what in (there, listed, "shards that are there"), (missing, {}, f"views of {out.name}"):
+    for folders, sums, what in (existing, listed, "existing shards"), (missing, {}, f"views of {out.name}"):
         jobs = (
             joblib.delayed(_attempt)(
                 folder, out, views, camera, texture, seed, sums.get(shard_path(folder, out).name, {}).get("sha256")
             )
             for folder in folders
         )
-        found |= zip(folders, list(run_jobs(jobs, workers, what, len(folders))))  # to its end: joblib counts on it
+        found |= zip(
+            folders, list(run_jobs(jobs, workers, what, len(folders)))
+        )  # `list` runs the generator to its end, as joblib requires
     recorded = {
         shard_path(folder, out).name: {"seed": _scene_seed(folder, seed), "sha256": outcome}
         for folder, outcome in found.items()
@@ -105,7 +106,7 @@ def _attempt(
     seed: int,
     listed: str | None,
 ) -> str | InputError:
-    """SHA-256 of the scene's shard (`listed`, if that is given), recorded now if need be, or its failure."""
+    """SHA-256 of the scene's shard, recorded now if missing, or its failure; it has to be `listed`, if given."""
 
     def record() -> str:
         path = generate_shard(folder, out, views, camera, texture, seed)
@@ -116,17 +117,17 @@ def _attempt(
     try:
         return attempt(record)
     finally:
-        # meshes refer to themselves: without this they pile up until joblib takes the worker's memory for a leak
+        # meshes have reference cycles; without this joblib replaces the worker because of a supposed memory leak
         gc.collect()
 
 
 def _scene_seed(scene_folder: Path, seed: int) -> list[int]:
-    """Seed of a scene's views: its name is part of it, so that they do not depend on which other scenes there are."""
+    """Seed of a scene's views. It depends on the scene's name, not on the other scenes."""
     return [seed, zlib.crc32(scene_folder.name.encode())]
 
 
 def _listed(out: Path, run: dict[str, Any]) -> dict[str, Any]:
-    """What the manifest in `out` says of each shard, if there is a manifest: it has to be that of `run`."""
+    """The manifest's entries per shard, empty without a manifest; a manifest of another run is an `InputError`."""
     path = out / _MANIFEST
     if not path.exists():
         return {}
@@ -138,9 +139,9 @@ def _listed(out: Path, run: dict[str, Any]) -> dict[str, Any]:
 
 
 def verify(out: Path) -> list[str]:
-    """Hold the shards in `out` against its manifest; returns a message for each that is missing, damaged or foreign.
+    """Check the shards in `out` against its manifest; returns a message per missing, damaged or foreign shard.
 
-    Raises `InputError` for a manifest that is missing or not one.
+    Raises `InputError` for a missing or invalid manifest.
     """
     manifest = _read_manifest(out)
     camera = CameraConfig(**manifest["camera"])
@@ -152,7 +153,7 @@ def verify(out: Path) -> list[str]:
         path = out / name
         try:
             if name not in listed:
-                raise InputError(f"{path}: expected a shard that the manifest lists, found one that it does not")
+                raise InputError(f"{path}: expected a shard listed in the manifest, found another one")
             if not path.exists():
                 raise InputError(f"{path}: expected a shard, found nothing")
             _check_sum(path, listed[name]["sha256"])
@@ -187,7 +188,7 @@ def _read_manifest(out: Path) -> dict[str, Any]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of `zerobev generate`."""
+    """Add the arguments of `zerobev generate`."""
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the shards")
     parser.add_argument("--scenes", type=Path, metavar="DIR", help="folder in HM3DSem layout")
     parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
@@ -195,12 +196,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0)
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, default=1, help="processes on this machine (default: 1)")
-    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster that sees both folders")
+    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster with access to both folders")
     parser.add_argument("--verify", action="store_true", help="check the shards in --out instead")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Record, or verify, the shards of every split below `--out`; exit code 1 if a scene was skipped."""
+    """Record or verify the shards of all splits in `--out`; exit code 1 if a scene was skipped or a shard is bad."""
     if options.verify:
         problems = [problem for split in SPLITS for problem in verify(options.out / split)]
         if problems:

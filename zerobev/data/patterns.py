@@ -1,7 +1,7 @@
-"""Grey source images that the *Synth* textures are cut from: the DTD folder, or a bank of patterns.
+"""Grey source images of the *Synth* textures: the DTD folder, or procedural patterns and photographs.
 
-The paper takes them from the Describable Textures Dataset. Where that is not at hand, the families of
-patterns below and photographs that come inside scikit-image stand in: what matters is variety.
+The paper uses the Describable Textures Dataset. Without it, the families of patterns below and the photographs in the
+scikit-image package give similar variety.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from zerobev.common.errors import InputError
 Array = np.ndarray
 Rng = np.random.Generator
 
-#: Images inside the scikit-image wheel; read from there, so nothing is ever downloaded.
+#: Images in the scikit-image wheel, read without a download.
 PHOTOGRAPHS = (
     "brick.png",
     "chelsea.png",
@@ -35,26 +35,26 @@ PHOTOGRAPHS = (
 )
 
 
-# --- coordinates and fields: all (size, size) float64; u and v count periods of a pattern
+# --- coordinates and fields: all (size, size) float64; u and v are in periods of the pattern
 
 
 def plane(rng: Rng, size: int) -> tuple[Array, Array]:
-    """Coordinates u, v of the plane, turned and shifted at random; 4 to 9 periods a side."""
+    """Coordinates u, v of the plane, rotated and shifted at random; 4 to 9 periods per side."""
     y, x = np.mgrid[:size, :size] * (rng.uniform(4, 9) / size)
     angle, (shift_u, shift_v) = rng.uniform(0, 2 * np.pi), rng.uniform(0, 64, 2)
     return x * np.cos(angle) - y * np.sin(angle) + shift_u, x * np.sin(angle) + y * np.cos(angle) + shift_v
 
 
 def polar(rng: Rng, size: int) -> tuple[Array, Array]:
-    """Radius in periods (4 to 9 a side) and angle in turns, about a random centre."""
+    """Radius in periods (4 to 9 per side) and angle in turns, about a random centre."""
     y, x = np.mgrid[:size, :size] / size - rng.uniform(0.3, 0.7, (2, 1, 1))
     return rng.uniform(4, 9) * np.hypot(x, y), np.arctan2(y, x) / (2 * np.pi)
 
 
 def noise(rng: Rng, size: int, low: float, high: float, slope: float = 0, stretch: float = 1) -> Array:
-    """Gaussian noise of `low` to `high` cycles a side, zero mean, unit variance.
+    """Gaussian noise of `low` to `high` cycles per side, zero mean, unit variance.
 
-    Amplitudes fall with frequency to the power `slope`; `stretch` > 1 draws structures out along one axis.
+    Amplitudes fall with frequency to the power `slope`; `stretch` > 1 elongates structures along one axis.
     """
     fy, fx = np.meshgrid(np.fft.fftfreq(size, 1 / size), np.fft.rfftfreq(size, 1 / size), indexing="ij")
     angle = rng.uniform(0, np.pi)
@@ -66,14 +66,14 @@ def noise(rng: Rng, size: int, low: float, high: float, slope: float = 0, stretc
 
 
 def shade(rng: Rng) -> Callable[[Array, Array], Array]:
-    """A random grey in [0, 1] for each unit square of the plane (of period 64)."""
+    """A random grey in [0, 1] per unit square of the plane (period 64)."""
     table = rng.random((64, 64))
     return lambda u, v: table[np.floor(u).astype(int) % 64, np.floor(v).astype(int) % 64]
 
 
 def cells(rng: Rng, size: int) -> tuple[Array, ...]:
     """Voronoi cells of a jittered grid: distances to the nearest and the second seed, the offset (2) from the
-    nearest, turned by a random angle for each cell, and a grey of each cell."""
+    nearest, rotated by a random angle per cell, and a grey per cell."""
     u, v = plane(rng, size)
     points = np.stack([u, v], axis=-1)
     low, high = np.floor(points.min((0, 1))) - 1, points.max((0, 1)) + 1
@@ -121,25 +121,25 @@ def crossing(u: Array, v: Array, directions: int) -> Array:
 
 
 def brick(u: Array, v: Array, s: Callable[[Array, Array], Array]) -> Array:
-    """Shaded bricks in mortar, every other course shifted by half a brick."""
+    """Shaded bricks in mortar, every other row shifted by half a brick."""
     u = u + 0.5 * parity(2 * v)
     return np.where(np.minimum(fold(u) * 2, fold(2 * v)) > 0.25, 0.4 + 0.6 * s(u, 2 * v), 0)
 
 
 def truchet(u: Array, v: Array, s: Callable[[Array, Array], Array]) -> Array:
-    """Quarter circles in squares that are mirrored at random, joined to a maze."""
+    """Quarter circles in randomly mirrored squares, which join to a maze."""
     x, y = np.where(s(u, v) > 0.5, u % 1, 1 - u % 1), v % 1
     return -np.minimum(np.abs(np.hypot(x, y) - 0.5), np.abs(np.hypot(1 - x, 1 - y) - 0.5))
 
 
 def triangle(u: Array, v: Array, s: Callable[[Array, Array], Array]) -> Array:
-    """Equilateral triangles, each with a grey of its own."""
+    """Equilateral triangles, with a grey per triangle."""
     u, v = u - v / np.sqrt(3), v * 2 / np.sqrt(3)
     return s(2 * np.floor(u) + (u % 1 + v % 1 > 1), v)
 
 
 def ripples(rng: Rng, size: int) -> Array:
-    """Circular waves from several centres, superposed."""
+    """Superposed circular waves from four centres."""
     return sum((np.cos(2 * np.pi * polar(rng, size)[0] * 1.5) for _ in range(4)), np.zeros((size, size)))
 
 
@@ -149,7 +149,7 @@ def turbulence(rng: Rng, size: int) -> Array:
 
 
 def discs(rng: Rng, size: int) -> Array:
-    """Overlapping discs of many sizes and greys, painted one over the other."""
+    """Overlapping discs of many sizes and greys."""
     y, x = np.mgrid[:size, :size] / size
     image = np.zeros((size, size))
     for cy, cx, radius, grey in rng.random((80, 4)):
@@ -166,9 +166,9 @@ def scratches(rng: Rng, size: int) -> Array:
     return image
 
 
-# --- the kinds, by what they are functions of
+# --- the kinds of patterns, by their arguments
 
-#: (u, v, shade of unit squares)
+#: functions of (u, v, shade of unit squares)
 PLANE = {
     "stripes": lambda u, v, s: wave(u),
     "awning": lambda u, v, s: s(2 * u, 0 * v),
@@ -195,7 +195,7 @@ PLANE = {
     "maze": truchet,
     "carpet": lambda u, v, s: (16 * u).astype(int) & (16 * v).astype(int) & 63,
 }
-#: (radius, turns, count of arms)
+#: functions of (radius, turns, number of arms)
 POLAR = {
     "rings": lambda r, a, k: wave(r),
     "spiral": lambda r, a, k: parity(2 * (r + (k % 3 + 1) * a)) + 0.3 * r,
@@ -205,7 +205,7 @@ POLAR = {
     "dartboard": lambda r, a, k: (parity(r) + parity(2 * k * a)) % 2 + 0.05 * r,
     "web": lambda r, a, k: np.maximum(fold(r * (1 + 0.2 * fold(2 * k * a))), fold(2 * k * a)) ** 10,
 }
-#: (distance to the nearest and the second seed, turned offset from the nearest, grey of the cell)
+#: functions of (distances to the nearest and the second seed, rotated offset from the nearest (2), grey of the cell)
 CELLS = {
     "bumps": lambda f, g, x, y, s: -f,
     "mosaic": lambda f, g, x, y, s: s,
@@ -222,7 +222,7 @@ CELLS = {
     "hoops": lambda f, g, x, y, s: -np.abs(f - 0.3) * (0.3 + s),
     "crescents": lambda f, g, x, y, s: (f < 0.4) * (np.hypot(x - 0.2, y) > 0.36) * (0.6 + s),
 }
-#: (rng, size)
+#: functions of (rng, size)
 FIELDS = {
     "clouds": lambda rng, n: noise(rng, n, 1, 128, slope=2),
     "smoke": lambda rng, n: noise(rng, n, 1, 128, slope=1.3),
@@ -246,7 +246,7 @@ KINDS = (*PLANE, *POLAR, *CELLS, *FIELDS)
 
 
 def procedural(kind: str, rng: Rng, size: int) -> Array:
-    """A pattern of `kind` (one of `KINDS`): (size, size) float32 that spans [0, 1]."""
+    """A pattern of `kind` (one of `KINDS`): (size, size) float32 from 0 to 1."""
     if kind in PLANE:
         image = PLANE[kind](*plane(rng, size), shade(rng))
     elif kind in POLAR:
@@ -261,11 +261,11 @@ def procedural(kind: str, rng: Rng, size: int) -> Array:
 
 
 def read_grey(path: Path) -> Array:
-    """Read an image file as (h, w) float32 in [0, 1]; a file that is no whole image is an `InputError`."""
+    """Read a PNG or JPEG file as (h, w) float32 in [0, 1]; a damaged file or one of another kind is an `InputError`."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=("PNG", "JPEG")) as image:
             return np.asarray(image.convert("L"), np.float32) / 255
-    except (OSError, SyntaxError, ValueError) as error:
+    except Exception as error:  # PIL raises many kinds of error for a damaged image
         raise InputError(f"{path}: expected an image, found {error}") from error
 
 
@@ -276,10 +276,9 @@ def photograph(name: str) -> Array:
 
 
 class SourceImages:
-    """Where random grey images come from: the DTD folder if one is given, else patterns and photographs.
+    """Random grey images: from the DTD folder if one is given, else patterns and photographs.
 
-    `dtd` is a folder with `images/<category>/*.jpg`; one without any is an `InputError`. Files are read
-    when they are drawn.
+    `dtd` is a folder with `images/<category>/*.jpg`; none found is an `InputError`. Files are read when drawn.
     """
 
     def __init__(self, dtd: Path | None = None, size: int = 96) -> None:
@@ -299,5 +298,5 @@ class SourceImages:
 
 
 def _fixed(read: Callable[[], Array]) -> Callable[[Rng], Array]:
-    """A kind that is one image: nothing of it is drawn."""
+    """A kind with a single image; it draws no random numbers."""
     return lambda _: read()

@@ -1,4 +1,4 @@
-"""Shards: the views of one scene in one HDF5 file, written whole and read view by view."""
+"""Shards: one HDF5 file per scene with its views, written atomically and read view by view."""
 
 import hashlib
 import json
@@ -24,21 +24,21 @@ _FIELDS = tuple(field.name for field in fields(View))
 
 
 def recorded_with(camera: CameraConfig, texture: TextureConfig) -> dict[str, Any]:
-    """The settings that views depend on: the camera, and the white fraction of *Mod. Sem.* textures."""
+    """The settings on which views depend: the camera, and the white fraction of *Mod. Sem.* textures."""
     return {"camera": camera, "modsem_share": texture.modsem_fraction}
 
 
 def write_shard(
     path: Path, scene: Scene, views: Iterable[View], camera: CameraConfig, texture: TextureConfig, seed: int
 ) -> None:
-    """Write `views` (one at least) of `scene` to `path`, each as it comes; nothing is left behind when one fails."""
+    """Write `views` (at least one) of `scene` to `path`, one by one; if a view fails, no file is left."""
     with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
-        for index, view in enumerate(_while_there_is_room(views, path.parent)):
+        for index, view in enumerate(_checked_for_space(views, path.parent)):
             values = tuple(getattr(view, name) for name in _FIELDS)
             if index == 0:
                 record = np.dtype([(name, value.dtype, value.shape) for name, value in zip(_FIELDS, values)])
-                # One record and one chunk a view: a training sample reads one view at random, in one call.
-                # Not lzf: what it writes for the same views differs from time to time. Gzip reads three times slower.
+                # One record and one chunk per view: a training sample reads one random view in one call.
+                # lzf's output is not reproducible; gzip takes three times as long to read.
                 storage = {"maxshape": (None,), "chunks": (1,), "compression": hdf5plugin.Zstd(clevel=3)}
                 table = file.create_dataset("views", (0,), record, **storage)
             table.resize(index + 1, axis=0)
@@ -50,8 +50,8 @@ def write_shard(
         file.attrs["seed"] = seed
 
 
-def _while_there_is_room(views: Iterable[View], folder: Path) -> Iterator[View]:
-    """HDF5 cannot close a file that it could not write, and takes the process with it: the disk is asked before."""
+def _checked_for_space(views: Iterable[View], folder: Path) -> Iterator[View]:
+    """HDF5 aborts the process when the disk fills up, so free space is checked before each write."""
     for view in views:
         needed = (1 << 20) + 2 * sum(getattr(view, name).nbytes for name in _FIELDS)
         if (free := shutil.disk_usage(folder).free) < needed:
@@ -60,9 +60,9 @@ def _while_there_is_room(views: Iterable[View], folder: Path) -> Iterator[View]:
 
 
 class Shard:
-    """Reads a shard. Each process opens the file on its first use, so that a `Shard` may travel to workers.
+    """Reads a shard. Each process opens the file at its first use, so that a `Shard` can be sent to other processes.
 
-    Raises `InputError` for a file that is missing, damaged, or recorded with another camera or *Mod. Sem.* share.
+    Raises `InputError` for a file that is missing, damaged, or recorded with another camera or *Mod. Sem.* fraction.
     """
 
     def __init__(self, path: Path, camera: CameraConfig, texture: TextureConfig) -> None:
@@ -81,7 +81,7 @@ class Shard:
         if not matches(found, expected):
             raise InputError(f"{path}: expected views recorded with {plain(expected)}, found {found}")
         self._views: h5py.Dataset | None = None
-        self._opened_by = 0  # the process; one that was forked off must not use the file of its parent
+        self._opened_by = 0  # id of the process; a forked one must not use its parent's file
 
     def __len__(self) -> int:
         return self._length
@@ -90,16 +90,16 @@ class Shard:
         return {**self.__dict__, "_views": None}
 
     def view(self, index: int) -> View:
-        """View number `index`."""
+        """View `index`."""
         try:
             if self._views is None or self._opened_by != os.getpid():
-                # without a cache of chunks: a view is read once an epoch, and HDF5 would keep megabytes of every shard
+                # no chunk cache: a view is read once per epoch, and the cache takes megabytes per shard
                 self._views, self._opened_by = h5py.File(self.path, rdcc_nbytes=0)["views"], os.getpid()
             record = np.empty(1, self._views.dtype)
-            place = self._views.id.get_space()
-            place.select_hyperslab((index,), (1,))
-            # read as the file's own type: into numpy's, HDF5 converts field by field, twice the time of all else
-            self._views.id.read(h5py.h5s.create_simple((1,)), place, record, self._views.id.get_type())
+            space = self._views.id.get_space()
+            space.select_hyperslab((index,), (1,))
+            # read with the file's own type: HDF5 converts to NumPy's field by field, which triples the time
+            self._views.id.read(h5py.h5s.create_simple((1,)), space, record, self._views.id.get_type())
             return View(**{name: record[0][name] for name in _FIELDS})
         except (OSError, KeyError) as error:
             raise InputError(f"{self.path}: expected view {index}, found {_short(error)}") from None

@@ -1,4 +1,4 @@
-"""A view: everything the sensors record at one pose, and the drawing of poses worth recording."""
+"""A view: all that the sensors record at one pose. `ViewSource` draws poses that see enough of the map."""
 
 from dataclasses import dataclass, replace
 
@@ -14,19 +14,19 @@ from zerobev.rendering.photograph import Photographer
 from zerobev.rendering.poses import navigable_floor
 from zerobev.scenes.scene import Scene
 
-_GLANCE_PX = 64  # a larger image is cast only where one of this size sees enough of the map
-_TRIES = 50  # poses drawn for one view before the scene is given up
+_PREVIEW_PX = 64  # larger images are cast only if one of this size sees enough of the map
+_MAX_TRIES = 50  # poses drawn per view
 
 
 @dataclass(frozen=True)
 class View:
-    """One pose, complete: any sample of any stream is made of it by look-up. H pixels and M cells a side."""
+    """One pose: samples of all streams are made of it by look-up. H pixels and M cells per side."""
 
     rgb: np.ndarray  #: (H, H, 3) uint8 photograph
-    depth: np.ndarray  #: (H, H) float32 planar depth, metres, 0 for nothing
-    fpv_texel: np.ndarray  #: (H, H, 3) int16 chart, row, column; chart -1 for nothing
+    depth: np.ndarray  #: (H, H) float32 planar depth, metres, 0 for no surface
+    fpv_texel: np.ndarray  #: (H, H, 3) int16 chart, row, column; chart -1 for no surface
     fpv_instance: np.ndarray  #: (H, H) uint16
-    fpv_modsem: np.ndarray  #: (H, H) uint8: bit b is white in draw b of the scene's *Mod. Sem.* textures
+    fpv_modsem: np.ndarray  #: (H, H) uint8: bit b is set if white in draw b of the scene's *Mod. Sem.* textures
     bev_texel: np.ndarray  #: (M, M, 3) int16
     bev_instance: np.ndarray  #: (M, M) uint16
     bev_modsem: np.ndarray  #: (M, M) uint8
@@ -36,47 +36,40 @@ class View:
 
 
 class ViewSource:
-    """Draws views of one scene. Poses do not depend on `texture`, which is that of the *Mod. Sem.* draws."""
+    """Draws views of one scene. `texture` sets the *Mod. Sem.* textures; poses do not depend on it."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        camera: CameraConfig,
-        texture: TextureConfig,
-        rng: np.random.Generator,
-        agent: AgentConfig | None = None,
-    ) -> None:
-        self._agent = agent or AgentConfig()
+    def __init__(self, scene: Scene, camera: CameraConfig, texture: TextureConfig, rng: np.random.Generator) -> None:
+        self._agent = AgentConfig()
         self._camera = camera
         self._rng = rng
         self.scene = scene
         self.floor = navigable_floor(scene, self._agent, rng)
         self._caster = RayCaster(scene)
         self._photographer = Photographer(scene, camera)
-        drawn = rng.spawn(1)[0]
-        draws = (modsem_textures(chart, texture, drawn) for chart in scene.chart_instance)
+        child = rng.spawn(1)[0]
+        draws = (modsem_textures(chart, texture, child) for chart in scene.chart_instance)
         bit = (1 << np.arange(MODSEM_DRAWS)).astype(np.uint8)
         bits = (np.einsum("drc,d->rc", white.view(np.uint8), bit).ravel() for white in draws)
-        self._modsem = np.concatenate([*bits, [np.uint8(0)]])  # what comes last is nothing
+        self._modsem = np.concatenate([*bits, [np.uint8(0)]])  # the last entry means 'no surface'
 
     def draw(self) -> View:
-        """The view at a fresh pose; poses that face a wall are refused.
+        """The view at a random pose that sees enough of the map, `AgentConfig.min_view` of it.
 
-        Raises `InputError` where no pose of the scene sees enough of the map.
+        Raises `InputError` if none is found.
         """
-        for _ in range(_TRIES):
+        for _ in range(_MAX_TRIES):
             pose = self.floor.draw(self._rng)
             view = self.at(pose)
             if view is not None:
                 return view
         raise InputError(
             f"scene {self.scene.name}: expected a view of at least {self._agent.min_view:.0%} of the map, "
-            f"found none in {_TRIES} poses"
+            f"found none in {_MAX_TRIES} poses"
         )
 
     def at(self, pose: Pose) -> View | None:
-        """The view at `pose`, or None where it sees too little of the map."""
-        if self._camera.fpv_px > _GLANCE_PX and self._is_blocked(replace(self._camera, fpv_px=_GLANCE_PX), pose):
+        """The view at `pose`, or None if it sees too little of the map."""
+        if self._camera.fpv_px > _PREVIEW_PX and self._is_blocked(replace(self._camera, fpv_px=_PREVIEW_PX), pose):
             return None
         fpv = self._caster.fpv(pose, self._camera)
         fov = fov_mask(fpv.distance, self._camera)

@@ -1,4 +1,4 @@
-"""pyrender, imported after its environment is set, and the one OpenGL context of a process."""
+"""pyrender, imported after its environment is set, and the process's only OpenGL context."""
 
 import atexit
 import functools
@@ -9,20 +9,20 @@ import numpy as np
 
 from zerobev.common.errors import SetupError
 
-# pyrender chooses its platform on import: without this it looks for a window; a user's own choice stands
+# pyrender selects its platform at import; the default needs a window; a value set by the user has priority
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-# it imports pyglet, for a viewer that is not used here, and pyglet fails where only a part of X11 is installed
+# pyrender imports pyglet for its viewer, and pyglet fails if X11 is partly installed
 os.environ.setdefault("PYGLET_HEADLESS", "true")
-# pyrender 0.1.45 still asks for the spelling that NumPy 2 removed
+# pyrender 0.1.45 uses a name that NumPy 2 removed
 if not hasattr(np, "infty"):
     vars(np)["infty"] = np.inf
 
-#: Debian's names of the packages that a platform needs.
+#: Platform -> required Debian packages.
 _PACKAGES = {"egl": "libegl1 libgl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
 
 
 def _setup_error(error: Exception) -> SetupError:
-    """One line: what is missing, and the remedy for the platform that is set."""
+    """One line: the missing part, and the remedy for the selected platform."""
     platform, device = os.environ["PYOPENGL_PLATFORM"], os.environ.get("EGL_DEVICE_ID")
     expected = f"PYOPENGL_PLATFORM: expected {' or '.join(_PACKAGES)}, and OpenGL that works"
     if platform not in _PACKAGES:
@@ -30,14 +30,14 @@ def _setup_error(error: Exception) -> SetupError:
     found = f"{platform} with {type(error).__name__}: {' '.join(str(error).split())}"
     remedy = f"install {_PACKAGES[platform]} (Debian's packages)"
     if platform == "egl" and device is not None:
-        remedy = f"set EGL_DEVICE_ID to a device that is there, or to none (found {device!r}), or {remedy}"
+        remedy = f"set EGL_DEVICE_ID to an existing device, or to none (found {device!r}), or {remedy}"
     if platform == "osmesa":
         remedy += ", or set PYOPENGL_PLATFORM=egl"
     return SetupError(f"{expected}, found {found}; {remedy}")
 
 
 class _Missing:
-    """In place of pyrender where it cannot be imported: any use raises the `SetupError`."""
+    """Replaces pyrender if its import fails: any use raises the `SetupError`."""
 
     def __init__(self, error: Exception) -> None:
         self._error = error
@@ -49,28 +49,28 @@ class _Missing:
 try:
     from OpenGL.plugins import FormatHandler
 
-    # PyOpenGL 3.1.0, which pyrender asks for, has the name that a reference to a C value had before Python 3.12
+    # PyOpenGL 3.1.0, which pyrender requires, has the name of C references before Python 3.12
     FormatHandler("ctypesparameter", "OpenGL.arrays.ctypesparameters.CtypesParameterHandler", ["_ctypes.CArgObject"])
 
     import pyrender
-except Exception as error:  # without the platform's library, PyOpenGL raises ImportError, AttributeError, OSError, ...
+except Exception as error:  # PyOpenGL raises ImportError, AttributeError, OSError, ... if a library is missing
     pyrender = _Missing(error)
 
 
 @functools.cache
 def renderer() -> "pyrender.OffscreenRenderer":
-    """The process's one renderer: closing one of several would take the display from the others.
+    """The process's only renderer: if there were several, closing one would break the others.
 
-    Raises `SetupError`, with the remedy, where no OpenGL context can be made.
+    Raises `SetupError`, with the remedy, if no OpenGL context can be created.
     """
     try:
         made = pyrender.OffscreenRenderer(1, 1)
-        from zerobev.rendering.shaders import SurfaceRenderer  # it builds on pyrender, which may be missing
+        from zerobev.rendering.shaders import SurfaceRenderer  # imports pyrender, which may be missing
 
         made._renderer = SurfaceRenderer(1, 1)
     except SetupError:
         raise
-    except Exception as error:  # of pyrender, PyOpenGL or ctypes
+    except Exception as error:  # pyrender, PyOpenGL and ctypes raise many kinds of error
         raise _setup_error(error) from error
     atexit.register(made.delete)
     return made

@@ -1,4 +1,4 @@
-"""Photographs (RGB) of a scene, rasterised by pyrender through EGL: a GPU where there is one, else Mesa."""
+"""Photographs (RGB) of a scene, rasterised by pyrender with EGL, on a GPU or by Mesa on the CPU."""
 
 import numpy as np
 
@@ -7,19 +7,19 @@ from zerobev.geometry.cameras import Pose
 from zerobev.rendering.opengl import pyrender, renderer
 from zerobev.scenes.scene import Scene
 
-_SUPERSAMPLING = 2  # rendered this much larger and averaged: fine textures would flicker otherwise
-_NEAR_M, _FAR_M = 0.05, 100.0
-_SKY = (0.62, 0.75, 0.92)  # seen where a home has a hole
-_AMBIENT, _HEADLAMP = 0.35, 6.0  # light of scenes that bring none of their own
+_SUPERSAMPLING = 2  # rendered this much larger and averaged, against aliasing
+NEAR_M, FAR_M = 0.05, 100.0
+_SKY = (0.62, 0.75, 0.92)  # background
+_AMBIENT, _HEADLAMP = 0.35, 6.0  # light of scenes without baked light
 # camera axes: ours x right, y down, z forward; OpenGL's x right, y up, z backward
 _CAMERA_R_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 class Photographer:
-    """Takes photographs of one scene with one camera. All of a process share one GL context."""
+    """Renders photographs of one scene with one camera. All instances of a process share one OpenGL context."""
 
     def __init__(self, scene: Scene, camera: CameraConfig) -> None:
-        from zerobev.rendering.surfaces import Solid, primitives  # it defines meshes of pyrender, which may be missing
+        from zerobev.rendering.surfaces import Solid, primitives  # imports pyrender, which may be missing
 
         self._camera = camera
         self._flags = pyrender.RenderFlags.FLAT if scene.unlit else pyrender.RenderFlags.NONE
@@ -30,7 +30,7 @@ class Photographer:
         self._scene.add(Solid(solid))
         side = camera.fpv_px * _SUPERSAMPLING
         focal = camera.focal_px * _SUPERSAMPLING
-        lens = pyrender.IntrinsicsCamera(focal, focal, side / 2, side / 2, _NEAR_M, _FAR_M)
+        lens = pyrender.IntrinsicsCamera(focal, focal, side / 2, side / 2, NEAR_M, FAR_M)
         self._eye = self._scene.add(lens)
         if not scene.unlit:
             self._scene.add(pyrender.PointLight(intensity=_HEADLAMP), parent_node=self._eye)
@@ -44,7 +44,7 @@ class Photographer:
         return np.rint(total / np.float32(len(samples))).astype(np.uint8)
 
     def depth(self, pose: Pose) -> np.ndarray:
-        """(S, S) float32 planar depth in metres from `pose`, super-sampled, 0 for nothing: it checks the ray caster."""
+        """(S, S) float32 planar depth in metres from `pose`, super-sampled, 0 for no surface; checks the ray caster."""
         return self._render(pose)[1]
 
     def _render(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +60,7 @@ class Photographer:
 
 
 def world_T_opengl(pose: Pose, camera: CameraConfig) -> np.ndarray:
-    """(4, 4) float64: the camera at `pose`, with the axes of OpenGL's cameras."""
+    """(4, 4) float64 transform from the camera at `pose`, with OpenGL's axes, to the world."""
     world_T_camera = np.eye(4)
     world_T_camera[:3, :3] = pose.world_R_camera @ _CAMERA_R_OPENGL
     world_T_camera[:3, 3] = pose.centre(camera)
@@ -68,7 +68,7 @@ def world_T_opengl(pose: Pose, camera: CameraConfig) -> np.ndarray:
 
 
 def render(scene: "pyrender.Scene", flags: int, side_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """(S, S, 3) uint8 colours and (S, S) float32 depth of a scene, through the process's one GL context."""
-    made = renderer()
-    made.viewport_width = made.viewport_height = side_px
-    return made.render(scene, flags)
+    """(S, S, 3) uint8 colours and (S, S) float32 depth in metres of a scene, rendered by the process's renderer."""
+    shared = renderer()
+    shared.viewport_width = shared.viewport_height = side_px
+    return shared.render(scene, flags)

@@ -1,4 +1,4 @@
-"""Where an agent can stand in a scene, and poses drawn uniformly from there (paper, Section 4)."""
+"""The navigable floor of a scene, and poses drawn uniformly from it (paper, Section 4)."""
 
 from dataclasses import dataclass
 
@@ -12,46 +12,46 @@ from zerobev.config import LABELS, AgentConfig
 from zerobev.geometry.cameras import Pose
 from zerobev.scenes.scene import Scene
 
-_SAMPLES_PER_M2 = 2000  # surface samples that find obstacles: five for each 5 cm cell of a horizontal surface
-_LEVEL = 0.9  # a floor face's normal points up at least this much
+_SAMPLES_PER_M2 = 2000  # density of the samples of obstacles: five per 5 cm cell of a horizontal surface
+_MIN_UP = 0.9  # minimum vertical part of a floor face's unit normal
 
 
 @dataclass(frozen=True)
 class NavigableFloor:
-    """Free floor of a scene: centres of the cells where the agent's axis may stand."""
+    """Free floor of a scene: centres of the cells for the agent's axis."""
 
     cells: np.ndarray  #: (N, 3) float64, metres, world
     grid_m: float
 
     @property
     def area_m2(self) -> float:
-        """Navigable area."""
+        """Navigable area, m2."""
         return len(self.cells) * self.grid_m**2
 
     def draw(self, rng: np.random.Generator) -> Pose:
-        """A pose with position uniform over the free floor and uniform heading."""
+        """A pose with uniform position on the free floor and uniform heading."""
         x, y, z = self.cells[rng.integers(len(self.cells))]
         dx, dy = rng.uniform(-self.grid_m / 2, self.grid_m / 2, 2)
         return Pose(float(x + dx), float(y + dy), float(z), float(rng.uniform(-np.pi, np.pi)))
 
 
 def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) -> NavigableFloor:
-    """Rasterise the floor, take away what the agent's body would meet, and keep patches of a useful size.
+    """Rasterise the floor per storey, remove cells where the agent's body would collide, and remove small patches.
 
-    Several storeys are handled one above the other; nobody stands where a floor ends or steps up or down by more than
-    `climb_m`. Raises `InputError` where no free floor is left.
+    Cells at a floor's end, or at a step of more than `climb_m`, are not navigable. Raises `InputError` if no free floor
+    is left.
     """
     corner = scene.vertices[scene.faces].astype(np.float64)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    up = np.abs(normal[:, 2]) > _LEVEL * np.linalg.norm(normal, axis=1)
+    up = np.abs(normal[:, 2]) > _MIN_UP * np.linalg.norm(normal, axis=1)
     floor = up & (scene.instance_label[scene.face_instance] == LABELS.index("floor"))
     if not floor.any():
         raise InputError(f"scene {scene.name}: expected a horizontal face of class floor, found none")
     low = corner[floor].min(axis=(0, 1))[:2]
     shape = tuple(np.ceil((corner[floor].max(axis=(0, 1))[:2] - low) / agent.grid_m).astype(int) + 1)
     lowest, highest = corner[floor][..., 2].min() + agent.climb_m, corner[floor][..., 2].max() + agent.height_m
-    in_the_way = ~floor & (corner[..., 2].max(axis=1) > lowest) & (corner[..., 2].min(axis=1) < highest)
-    x, y, z = _surface_samples(corner[in_the_way], rng)
+    obstacle = ~floor & (corner[..., 2].max(axis=1) > lowest) & (corner[..., 2].min(axis=1) < highest)
+    x, y, z = _surface_samples(corner[obstacle], rng)
     i, j = (((axis - start) / agent.grid_m).astype(np.float32) for axis, start in zip((x, y), low))
     inside = np.flatnonzero((i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]))
     obstacle_m = z.take(inside)
@@ -62,11 +62,11 @@ def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) 
         above = obstacle_m - height.ravel().take(obstacle_cell)
         free = np.isfinite(height) & ~_is_edge(height, agent.climb_m)
         free.ravel()[obstacle_cell[(above > agent.climb_m) & (above < agent.height_m)]] = False
-        # the axis keeps the radius from everything that is not free, the border of the grid included
-        room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * agent.grid_m > agent.radius_m
-        patch, count = ndimage.label(room)
-        area = ndimage.sum_labels(room, patch, np.arange(count + 1)) * agent.grid_m**2
-        i, j = np.nonzero(room & (area[patch] >= agent.island_m2))
+        # the axis keeps a distance of the radius to cells that are not free, and to the border of the grid
+        standing = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * agent.grid_m > agent.radius_m
+        patch, count = ndimage.label(standing)
+        area = ndimage.sum_labels(standing, patch, np.arange(count + 1)) * agent.grid_m**2
+        i, j = np.nonzero(standing & (area[patch] >= agent.island_m2))
         cells.append(np.stack([*(low[:, None] + (np.stack([i, j]) + 0.5) * agent.grid_m), height[i, j]], axis=1))
     found = np.concatenate(cells)
     if not len(found):
@@ -75,12 +75,12 @@ def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) 
 
 
 def _surface_samples(corner: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """x, y and z, float32, of points drawn uniformly on each of the triangles `corner` (F, 3, 3)."""
+    """x, y and z, float32, of points drawn uniformly on the triangles `corner` (F, 3, 3)."""
     edge = corner[:, 1:] - corner[:, :1]
     area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) / 2
     face = np.repeat(np.arange(len(corner)), np.ceil(area * _SAMPLES_PER_M2).astype(int))
     a, b = rng.random((2, len(face)), np.float32)
-    beyond = a + b > 1  # the other half of the parallelogram is turned back onto the triangle
+    beyond = a + b > 1  # points in the other half of the parallelogram are mirrored into the triangle
     a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
     sides = np.stack([corner[:, 0], edge[:, 0], edge[:, 1]]).astype(np.float32)
     start, first, second = (side.T for side in sides)
@@ -90,16 +90,16 @@ def _surface_samples(corner: np.ndarray, rng: np.random.Generator) -> tuple[np.n
 def _storeys(
     scene: Scene, floor: np.ndarray, low: np.ndarray, shape: tuple[int, int], agent: AgentConfig
 ) -> list[np.ndarray]:
-    """Floor height of each grid cell, one (I, J) array per storey from the lowest up; NaN where there is no floor.
+    """Floor height of each grid cell: one (I, J) array per storey, from the lowest up, NaN without a floor.
 
-    Floors of one storey are no step higher than `climb_m` apart, so that a gallery ends at its edge. Where stairs of
-    the class floor join two storeys, one array has the upper floor of each cell, and the next one the lower floor.
+    Sorted floor heights more than `climb_m` apart are of different storeys. If stairs of class floor join two storeys,
+    one array has the upper floor of each cell, and the next one the lower floor.
     """
     embree = EmbreeScene()
     mesh = TriangleMesh(embree, scene.vertices.astype(np.float32), scene.faces[floor].astype(np.int32))
     i, j = np.indices(shape)
-    start = np.full(shape, scene.vertices[scene.faces, 2].max() + 1.0)  # of unused vertices any may be anywhere
-    layers = []  # from the top down; one layer may be upper floor here and lower floor there
+    start = np.full(shape, scene.vertices[scene.faces, 2].max() + 1.0)  # unused vertices may be anywhere
+    layers = []  # from the top down; one layer may mix floors of several storeys
     while True:
         origins = np.stack([low[0] + (i + 0.5) * agent.grid_m, low[1] + (j + 0.5) * agent.grid_m, start], axis=-1)
         origins = np.ascontiguousarray(origins.reshape(-1, 3), np.float32)
@@ -110,13 +110,13 @@ def _storeys(
         layers.append(height)
         if not hit.any():
             break
-        # what lies within the agent's height below is the same storey (the floor under a rug)
+        # surfaces within the agent's height below are of the same storey, such as the floor under a rug
         start = np.where(hit, height - agent.height_m, -1e6)
-    del mesh  # Embree points into its arrays until here
+    del mesh  # Embree uses its arrays until here
     heights = np.sort(np.concatenate([height[np.isfinite(height)] for height in layers]))
-    lowest = heights[1:][np.diff(heights) > agent.climb_m]  # of each storey but the first
-    storey = np.searchsorted(lowest, layers, side="right")
-    of_storeys = [-np.sort(np.where(storey == k, np.negative(layers), np.nan), axis=0) for k in range(len(lowest) + 1)]
+    starts = heights[1:][np.diff(heights) > agent.climb_m]  # lowest height of each storey except the first
+    storey = np.searchsorted(starts, layers, side="right")
+    of_storeys = [-np.sort(np.where(storey == k, np.negative(layers), np.nan), axis=0) for k in range(len(starts) + 1)]
     return [height for layer in of_storeys for height in layer if np.isfinite(height).any()]
 
 

@@ -1,18 +1,16 @@
-"""Pairs the long way, without a G-buffer: every texture is rendered anew, as the paper does. For comparison."""
+"""Pairs without a G-buffer: every texture is rendered anew, as in the paper. For comparison."""
 
 import numpy as np
 
 from zerobev.config import CameraConfig
 from zerobev.geometry.cameras import Pose
 from zerobev.rendering.opengl import pyrender
-from zerobev.rendering.photograph import render, world_T_opengl
+from zerobev.rendering.photograph import FAR_M, NEAR_M, render, world_T_opengl
 from zerobev.scenes.scene import Scene
-
-_NEAR_M, _FAR_M = 0.05, 100.0
 
 
 class Rerenderer:
-    """Renders pairs the long way: one pass of pyrender for each camera and texture, no G-buffer."""
+    """Renders pairs with one pass of pyrender per camera and texture."""
 
     def __init__(self, scene: Scene, camera: CameraConfig) -> None:
         self._camera = camera
@@ -26,13 +24,13 @@ class Rerenderer:
         self._scene.add(pyrender.Mesh(self._primitives))
         half = camera.fpv_px / 2
         self._eye = self._scene.add(
-            pyrender.IntrinsicsCamera(camera.focal_px, camera.focal_px, half, half, _NEAR_M, _FAR_M)
+            pyrender.IntrinsicsCamera(camera.focal_px, camera.focal_px, half, half, NEAR_M, FAR_M)
         )
         half_m = camera.bev_extent_m / 2
-        self._above = self._scene.add(pyrender.OrthographicCamera(half_m, half_m, _NEAR_M, _FAR_M))
+        self._above = self._scene.add(pyrender.OrthographicCamera(half_m, half_m, NEAR_M, FAR_M))
 
-    def wear(self, texture: list[np.ndarray]) -> None:
-        """Put a texture on the surfaces: a (rows, columns) bool image a chart."""
+    def set_texture(self, texture: list[np.ndarray]) -> None:
+        """Set the texture of the surfaces: one (rows, columns) bool image per chart."""
         nearest = pyrender.Sampler(magFilter=pyrender.GLTF.NEAREST, minFilter=pyrender.GLTF.NEAREST)
         for primitive, white in zip(self._primitives, texture):
             source = np.repeat(np.where(white, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
@@ -47,10 +45,10 @@ class Rerenderer:
         return colors[..., 0] > 127, depth
 
     def bev(self, pose: Pose) -> np.ndarray:
-        """M_zero (M, M) bool. Ceilings are culled: they have to be single-sided."""
+        """M_zero (M, M) bool. Ceilings have to be single-sided, so that they are culled."""
         camera = self._camera
         world_T_camera = np.eye(4)
-        world_T_camera[:3, :3] = pose.world_R_map  # OpenGL's cameras look against their z, with y up in the image
+        world_T_camera[:3, :3] = pose.world_R_map  # OpenGL's cameras look along -z, with y up in the image
         start = np.array([0, camera.bev_extent_m / 2, camera.height_m + camera.bev_above_m])
         world_T_camera[:3, 3] = pose.world_R_map @ start + (pose.x, pose.y, pose.floor_z)
         self._scene.set_pose(self._above, world_T_camera)

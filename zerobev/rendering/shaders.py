@@ -1,4 +1,4 @@
-"""Shaders for what pyrender's own leave out: alpha cutoffs, and factors that multiply colours in linear light."""
+"""Shaders with features that pyrender's lack: alpha cutoffs, and colour factors in linear light."""
 
 import shutil
 import tempfile
@@ -12,7 +12,7 @@ from zerobev.rendering.opengl import pyrender
 
 _CUTOFF = "uniform float alpha_cutoff;\n"
 
-# names are those by which pyrender sets uniforms and vertex attributes
+# pyrender sets uniforms and vertex attributes by these names
 _FLAT = (
     """#version 330 core
 struct Material {
@@ -52,7 +52,7 @@ void main() {
 #endif
     float alpha = tint.a * texel.a;
     if (alpha < alpha_cutoff) discard;
-    // a white tint leaves texels as they are, bit for bit
+    // a white tint leaves texels exactly unchanged
     vec3 color = tint.rgb == vec3(1.0) ? texel.rgb : to_srgb(to_linear(texel.rgb) * tint.rgb);
     frag_color = clamp(vec4(color, alpha), 0.0, 1.0);
 }
@@ -61,14 +61,14 @@ void main() {
 
 
 class SurfaceRenderer(Renderer):
-    """pyrender's renderer; fragments with an alpha below their material's `alphaCutoff` are left out.
+    """pyrender's renderer, without fragments with alpha below their material's `alphaCutoff`.
 
-    With the flag FLAT a fragment is texture times base colour times vertex colour, multiplied in linear light.
+    With the flag FLAT a fragment is the product of texture, base colour and vertex colour in linear light.
     """
 
     def __init__(self, width_px: int, height_px: int) -> None:
         super().__init__(width_px, height_px)
-        self._folder = tempfile.TemporaryDirectory(prefix="shaders-")  # shaders are read when they are first used
+        self._folder = tempfile.TemporaryDirectory(prefix="shaders-")  # pyrender reads shaders at their first use
         folder = Path(self._folder.name) / "shaders"
         shutil.copytree(Path(pyrender.__file__).with_name("shaders"), folder)
         (folder / "flat.frag").write_text(_FLAT)

@@ -1,4 +1,4 @@
-"""The surfaces of a photograph's mesh as primitives of pyrender: textures in atlases, colours, and transparency."""
+"""A photograph's mesh as pyrender's primitives: textures in atlases, colours, and transparency."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from zerobev.rendering.opengl import pyrender
 from zerobev.scenes.glb import TINT
 from zerobev.scenes.gltf import REPEAT, rgba
 
-_UV_SLACK = 1e-3  # texture coordinates of images that are not tiled may leave [0, 1] by rounding
-_ATLAS_PX = 8192  # side of the largest atlas of textures, unless one texture is larger
-_WHITE = Image.new("RGB", (1, 1), "white")  # of surfaces without a texture
+_UV_SLACK = 1e-3  # rounding of texture coordinates beyond [0, 1] if the image is not tiled
+_ATLAS_PX = 8192  # maximum side of an atlas, unless one texture is larger
+_WHITE = Image.new("RGB", (1, 1), "white")  # for surfaces without a texture
 
 
 class Solid(pyrender.Mesh):
-    """A mesh that is drawn before every `Glass`."""
+    """An opaque mesh, drawn before any `Glass`."""
 
     is_transparent = False
 
 
 class Glass(pyrender.Mesh):
-    """A mesh that is drawn after every `Solid`."""
+    """A transparent mesh, drawn after any `Solid`."""
 
     is_transparent = True
 
@@ -34,7 +34,7 @@ class _Textured:
 
     corners: np.ndarray  #: (3 F, 3) float32
     uv: np.ndarray  #: (3 F, 2) float32, in units of the image, u right and v down
-    tint: np.ndarray | None  #: (3 F, 4) float32, linear, multiplied with the image
+    tint: np.ndarray | None  #: (3 F, 4) float32 linear RGBA, multiplied with the image; None for white
     image: Image.Image
     wrap: tuple[int, int]
     alpha_mode: str
@@ -48,16 +48,13 @@ class _Textured:
 
 
 def primitives(photograph: trimesh.Scene) -> tuple[list[pyrender.Primitive], list[pyrender.Primitive]]:
-    """Primitives that hide what is behind them, and those that blend with it.
-
-    One per atlas of textures: a draw call costs more than its triangles.
-    """
+    """Opaque primitives and blended ones, one per atlas of textures: few draw calls render faster."""
     groups: dict[tuple, list[_Textured]] = defaultdict(list)
     for mesh in photograph.dump():
         if len(mesh.faces):
             part = _part(mesh)
-            place = (id(part.image), part.wrap) if part.tiled else (0, (REPEAT, REPEAT))
-            groups[part.double_sided, part.alpha_mode, part.alpha_cutoff, place].append(part)
+            image = (id(part.image), part.wrap) if part.tiled else (0, (REPEAT, REPEAT))
+            groups[part.double_sided, part.alpha_mode, part.alpha_cutoff, image].append(part)
     solid: list[pyrender.Primitive] = []
     glass: list[pyrender.Primitive] = []
     for (_, mode, *_), parts in groups.items():
@@ -66,7 +63,7 @@ def primitives(photograph: trimesh.Scene) -> tuple[list[pyrender.Primitive], lis
 
 
 def from_back_to_front(glass: list[pyrender.Primitive], eye: np.ndarray) -> list[pyrender.Primitive]:
-    """The triangles of `glass`, ordered by the distance of their centres from `eye` ((3,), world)."""
+    """The triangles of `glass`, ordered by the distance of their centres from `eye` ((3,), world), farthest first."""
     centre = np.concatenate([one.positions.reshape(-1, 3, 3).mean(axis=1) for one in glass])
     owner = np.repeat(np.arange(len(glass)), [len(one.positions) // 3 for one in glass])
     index = np.concatenate([np.arange(len(one.positions) // 3) for one in glass])
@@ -105,7 +102,7 @@ def _part(mesh: trimesh.Trimesh) -> _Textured:
 
 
 def _tint(mesh: trimesh.Trimesh) -> np.ndarray | None:
-    """(V, 4) float32 linear colours that multiply the texture; None for white."""
+    """(V, 4) float32 linear RGBA, multiplied with the texture; None for white."""
     if TINT in mesh.vertex_attributes:
         return np.asarray(mesh.vertex_attributes[TINT], np.float32)
     if mesh.visual.kind != "texture":
@@ -119,28 +116,28 @@ def _tint(mesh: trimesh.Trimesh) -> np.ndarray | None:
 
 
 def _textured_primitives(parts: list[_Textured]) -> list[pyrender.Primitive]:
-    """The primitives of surfaces of one kind, their images side by side in as few atlases as hold them."""
-    # four bytes per texel: OpenGL takes rows of three only where they are a multiple of four long
+    """The primitives of surfaces of one kind, with their images packed into atlases."""
+    # RGBA, because OpenGL needs rows of a multiple of four bytes
     images = {id(part.image): _texels(part) for part in parts}
     if len(images) > 1:
-        # a frame of their own border keeps linear look-ups within an image
+        # a frame that repeats the border keeps linear interpolation within an image
         images = {key: np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge") for key, image in images.items()}
     frame = int(len(images) > 1)
     found = []
-    for places in _shelves({key: image.shape[:2] for key, image in images.items()}):
-        rows, columns = (max(places[key][k] + images[key].shape[k] for key in places) for k in (0, 1))
+    for positions in _shelves({key: image.shape[:2] for key, image in images.items()}):
+        rows, columns = (max(positions[key][k] + images[key].shape[k] for key in positions) for k in (0, 1))
         atlas = np.zeros((rows, columns, 4), np.uint8)
-        for key, (row, column) in places.items():
+        for key, (row, column) in positions.items():
             atlas[row : row + images[key].shape[0], column : column + images[key].shape[1]] = images[key]
-        here = [part for part in parts if id(part.image) in places]
+        here = [part for part in parts if id(part.image) in positions]
         corners = np.concatenate([part.corners for part in here])
-        uv_px = [part.uv * part.image.size + np.add(places[id(part.image)], frame)[::-1] for part in here]
+        uv_px = [part.uv * part.image.size + np.add(positions[id(part.image)], frame)[::-1] for part in here]
         uv = np.concatenate(uv_px) / (columns, rows) * (1, -1) + (0, 1)  # OpenGL's v runs up
         tint = None
         if any(part.tint is not None for part in here):
             white = (np.ones((len(part.corners), 4), np.float32) for part in here)
             tint = np.concatenate([one if part.tint is None else part.tint for part, one in zip(here, white)])
-        # no mip maps: they would mix texels of neighbours in the atlas
+        # no mip maps: they would mix neighbouring images of the atlas
         linear = pyrender.GLTF.LINEAR
         sampler = pyrender.Sampler(magFilter=linear, minFilter=linear, wrapS=here[0].wrap[0], wrapT=here[0].wrap[1])
         material = pyrender.MetallicRoughnessMaterial(
@@ -156,7 +153,7 @@ def _textured_primitives(parts: list[_Textured]) -> list[pyrender.Primitive]:
 
 
 def _texels(part: _Textured) -> np.ndarray:
-    """(rows, columns, 4) uint8 image of a part; an opaque one has no use for alpha."""
+    """(rows, columns, 4) uint8 image of a part; alpha is 255 if it is opaque."""
     texels = rgba(part.image)
     if part.alpha_mode == "OPAQUE":
         texels = texels.copy()
@@ -173,7 +170,7 @@ def _primitive(
 
 
 def _shelves(shapes: dict[int, tuple[int, int]]) -> list[dict[int, tuple[int, int]]]:
-    """Row and column of the upper left corner of each image, dealt onto shelves of atlases: one dict per atlas."""
+    """Shelf packing: key -> (row, column) of each image's upper left corner, one dict per atlas."""
     atlases: list[dict[int, tuple[int, int]]] = [{}]
     row = column = height = 0
     for key, (rows, columns) in shapes.items():
@@ -188,7 +185,7 @@ def _shelves(shapes: dict[int, tuple[int, int]]) -> list[dict[int, tuple[int, in
 
 
 def _normals(corners: np.ndarray) -> np.ndarray:
-    """(3 F, 3) float32: each corner gets the normal of its face."""
+    """(3 F, 3) float32: the normal of each corner's face."""
     a, b, c = corners[0::3], corners[1::3], corners[2::3]
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)

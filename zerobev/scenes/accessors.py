@@ -1,6 +1,6 @@
-"""Numbers of a glTF 2.0 file: buffers, buffer views and accessors, decoded as the specification says.
+"""Numbers of a glTF 2.0 file: buffers, buffer views and accessors, decoded by the specification.
 
-trimesh reads neither normalized integers nor sparse values; other Python libraries leave the decoding to their callers.
+trimesh reads neither normalized integers nor sparse values; other Python libraries do not decode accessors.
 """
 
 import base64
@@ -15,18 +15,18 @@ from zerobev.common.errors import InputError
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _INDICES = (5121, 5123, 5125)
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_MOST_ZEROS = 1 << 24  # of a sparse accessor: a few bytes of header could ask for more than the memory holds
+_MAX_ELEMENTS = 1 << 24  # of a sparse accessor: a short header could demand more than the memory
 
 
 class Accessors:
-    """The arrays of a glTF file, of its JSON header and the binary chunk after it. Every fault is an `InputError`."""
+    """The arrays of a glTF file, from its JSON header and binary chunk. Every fault is an `InputError`."""
 
     def __init__(self, path: Path, header: dict[str, Any], binary: bytes) -> None:
         self._path, self._header, self._binary = path, header, binary
         self._buffers: dict[int, bytes] = {}
 
     def error(self, expected: str, found: str) -> InputError:
-        """The error that the file holds `found` where `expected` should be."""
+        """The error for `found` in place of `expected` in the file."""
         return InputError(f"{self._path}: expected {expected}, found {found}")
 
     def item(self, kind: str, index: Any) -> Any:
@@ -67,7 +67,7 @@ class Accessors:
         return memoryview(content)[start : start + length]
 
     def _rows(self, view: int, offset: int, count: int, kind: str, width: int, stride: int | None) -> np.ndarray:
-        """(count, width) numbers of a buffer view."""
+        """(count, width) numbers of a buffer view, `stride` bytes apart (None: adjacent)."""
         content, size = self.view(view), np.dtype(kind).itemsize
         stride = size * width if stride is None else stride
         fits = offset >= 0 and count >= 0 and stride >= size * width and stride % size == 0
@@ -79,7 +79,7 @@ class Accessors:
         return np.ndarray((count, width), kind, content, offset, (stride, size)).copy()
 
     def numbers(self, index: int, forms: tuple[str, ...]) -> tuple[np.ndarray, bool]:
-        """(count, width) numbers as they are stored, and whether they are normalized."""
+        """(count, width) numbers with their stored type, and whether they are normalized."""
         accessor = self.item("accessors", index)
         kind, count, sparse = _TYPES[accessor["componentType"]], accessor["count"], accessor.get("sparse")
         if accessor["type"] not in forms:
@@ -87,28 +87,28 @@ class Accessors:
         width = _WIDTHS[accessor["type"]]
         if "bufferView" in accessor:
             stride = self.item("bufferViews", accessor["bufferView"]).get("byteStride")
-            place = accessor["bufferView"], accessor.get("byteOffset", 0)
-            numbers = self._rows(*place, count, kind, width, stride)
+            start = accessor["bufferView"], accessor.get("byteOffset", 0)
+            numbers = self._rows(*start, count, kind, width, stride)
         elif sparse is None:
             raise self.error("data that is not compressed", f"none for accessor {index}")
-        elif not 0 <= count <= _MOST_ZEROS:
-            raise self.error(f"at most {_MOST_ZEROS} elements in sparse accessor {index}", str(count))
+        elif not 0 <= count <= _MAX_ELEMENTS:
+            raise self.error(f"at most {_MAX_ELEMENTS} elements in sparse accessor {index}", str(count))
         else:
             numbers = np.zeros((count, width), kind)
         if sparse is not None:
-            where, values, changed = sparse["indices"], sparse["values"], sparse["count"]
-            if where["componentType"] not in _INDICES:
-                raise self.error("unsigned integers as sparse indices", str(where["componentType"]))
-            at = where["bufferView"], where.get("byteOffset", 0)
-            rows = self._rows(*at, changed, _TYPES[where["componentType"]], 1, None)[:, 0]
+            indices, values, changed = sparse["indices"], sparse["values"], sparse["count"]
+            if indices["componentType"] not in _INDICES:
+                raise self.error("unsigned integers as sparse indices", str(indices["componentType"]))
+            start = indices["bufferView"], indices.get("byteOffset", 0)
+            rows = self._rows(*start, changed, _TYPES[indices["componentType"]], 1, None)[:, 0]
             if changed and rows.max() >= count:
                 raise self.error(f"sparse indices below {count} in accessor {index}", str(rows.max()))
-            at = values["bufferView"], values.get("byteOffset", 0)
-            numbers[rows] = self._rows(*at, changed, kind, width, None)
+            start = values["bufferView"], values.get("byteOffset", 0)
+            numbers[rows] = self._rows(*start, changed, kind, width, None)
         return numbers, accessor.get("normalized", False)
 
     def floats(self, index: int, *forms: str, normalized: bool = False) -> np.ndarray:
-        """(count, width) float32; `normalized` holds for integers whatever the accessor says."""
+        """(count, width) float32; with `normalized`, integers are normalized regardless of the accessor."""
         numbers, flag = self.numbers(index, forms)
         if numbers.dtype.kind != "f" and (flag or normalized):
             # the quotient is rounded once, in float64

@@ -4,7 +4,7 @@ import re
 
 from zerobev.config import LABELS, NO_LABEL
 
-#: The noun that a name ends with decides its class; annotators' misspellings are among the nouns.
+#: The last noun of a name decides its class; annotators' misspellings are included.
 _NOUNS = {
     "wall": "wall wal walll baseboard molding niche paneling relief",
     "floor": "floor floer florr floormat mat bathmat doormat rug carpet cerpet gravel landing lawn pavement paving",
@@ -16,7 +16,7 @@ _NOUNS = {
     "tv": "tv monitor whiteboard",
 }
 
-#: Whole names that belong to a class although their last noun does not.
+#: Whole names of a class that their last noun does not show.
 _ALSO = {
     "wall": "skirting board, tool board, tool rack, wall balk, wall balks, wall coping, wall corridor, wall of green, "
     "wall outside, wall panel, wall panel frame, wallkitchen island",
@@ -28,7 +28,7 @@ _ALSO = {
     "tv": "bulletin board, display, tube, tv led, unknown/ probably home theater player",
 }
 
-#: Whole names that belong to no class although they end with one of the nouns.
+#: Whole names without a class that end with one of the nouns.
 _NEITHER = (
     "bath wall, ceiling molding, ceiling wall, closet mirror wall, compound wall, fireplace wall, recessed wall, "
     "shower wall, stair wall, wall niche, closet floor, fireplace floor, patio floor, shower floor, excercise mat, "
@@ -37,7 +37,7 @@ _NEITHER = (
     "decoratrive plant, dried flowers, led tv, wall tv"
 )
 
-#: A name that ends with one of these nouns is a ceiling, misspellings included.
+#: A name that ends with one of these nouns is a ceiling; misspellings are included.
 _CEILINGS = frozenset(["ceiling", "ceilling", "ceiiling", "ceiilng", "ceiliing", "celing", "cieling", "roof"])
 _CEILINGS_TOO = frozenset(("ceiling panel", "ceiling panels"))
 _NO_CEILING = "lamp ceiling"
@@ -50,14 +50,14 @@ _LABEL_OF_NAME |= dict.fromkeys(_NEITHER.split(", "), NO_LABEL)
 def label_of(name: str) -> int:
     """Index into `config.LABELS` of an object called `name`, or `NO_LABEL`; case and runs of spaces do not matter.
 
-    Names are the free text of HM3DSem's annotators. All 1,624 of release 0.2 get the class that habitat-sim's
-    table gives them by way of Matterport3D's forty categories; other names follow the same rule, which is:
-    a whole name on one of two short lists of irregular ones, else the noun at its end ("office chair" is a
-    chair, "chair stand" is not). "unknown/ probably" in front and notes such as "/outside" behind are ignored.
+    Names are the free text of HM3DSem's annotators. The rule: a whole name in one of two short lists of exceptions,
+    else the last noun ("office chair" is a chair, "chair stand" is not). A leading "unknown/ probably" and trailing
+    notes such as "/outside" are ignored. All 1,624 names of release 0.2 get the same class as in habitat-sim's table
+    of Matterport3D's forty categories.
 
-    Choices that this makes: armchairs, recliners and beanbags are chairs; stools, ottomans, benches and plain
-    seats are not; rugs, carpets and most mats are floor; monitors and whiteboards are tv; bidets are toilets;
-    baseboards are wall; "decorative plant" and vases are not plants, "plant" and "flowers" are.
+    Consequences: armchairs, recliners and beanbags are chairs; stools, ottomans, benches and plain seats are not; rugs,
+    carpets and most mats are floor; monitors and whiteboards are tv; bidets are toilets; baseboards are wall;
+    "decorative plant" and vases are not plants, "plant" and "flowers" are.
     """
     tidy = _tidy(name)
     if tidy in _LABEL_OF_NAME:
@@ -69,9 +69,9 @@ def label_of(name: str) -> int:
 
 
 def is_ceiling(name: str) -> bool:
-    """Whether an object called `name` is a ceiling or a roof; the noun at its end decides, as in `label_of`.
+    """Whether an object called `name` is a ceiling or a roof; the last noun decides, as in `label_of`.
 
-    So "kitchen ceiling" and "ceilling" are ceilings, "ceiling lamp" and "ceiling fan" are not.
+    "kitchen ceiling" and "ceilling" are ceilings, "ceiling lamp" and "ceiling fan" are not.
     """
     tidy = _without_notes(_tidy(name))
     return tidy in _CEILINGS_TOO or (tidy.rpartition(" ")[2] in _CEILINGS and tidy != _NO_CEILING)

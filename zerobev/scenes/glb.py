@@ -1,7 +1,7 @@
-"""GLB files to trimesh's scenes, and GLB files from primitives.
+"""Reads GLB files as trimesh's scenes, and writes GLB files from primitives.
 
-trimesh turns v upwards with a rounding error, so UV coordinates are also kept untouched under a second name. Writing is
-our own: trimesh's exporter has no samplers, no 16-bit colours and no choice of JPEG quality.
+trimesh flips v with a rounding error, so the exact UV coordinates are stored as a second attribute. trimesh's exporter
+has no samplers, no 16-bit colours and no JPEG quality.
 """
 
 import json
@@ -17,7 +17,7 @@ import trimesh
 from zerobev.common.errors import InputError
 from zerobev.scenes.gltf import CLAMP, REPEAT, Asset, Material, Surface
 
-#: Vertex attributes that trimesh has no place for: UV coordinates with v down, and linear colours that multiply.
+#: Vertex attributes besides trimesh's own: UV coordinates with v down, and linear colours as factors.
 RAW_UV, TINT = "_TEXCOORD_0", "_TINT"
 
 _MAGIC, _VERSION = b"glTF", 2
@@ -28,31 +28,31 @@ _NEAREST_CLAMPED = {"magFilter": 9728, "minFilter": 9728, "wrapS": CLAMP, "wrapT
 
 @dataclass(frozen=True)
 class Primitive:
-    """Triangles of one material, as a GLB file stores them."""
+    """Triangles of one material, as stored in a GLB file."""
 
     name: str
     positions: np.ndarray  #: (V, 3) float32, metres
     faces: np.ndarray  #: (F, 3) integers
     uv: np.ndarray | None = None  #: (V, 2) float32, v down
     colors: np.ndarray | None = None  #: (V, 4) uint16, linear
-    image: bytes | None = None  #: a PNG or JPEG file; written once for primitives that share it and its wrap modes
+    image: bytes | None = None  #: a PNG or JPEG file; written once if shared with the same wrap modes
     base_color: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)  #: linear RGBA, multiplied with the image
     unlit: bool = False
     double_sided: bool = False
     alpha_mode: str = "OPAQUE"
     alpha_cutoff: float = 0.5
-    wrap: tuple[int, int] = (REPEAT, REPEAT)  #: of u and of v, where the image is not sampled nearest
+    wrap: tuple[int, int] = (REPEAT, REPEAT)  #: of u and of v; not used with nearest sampling
 
 
-def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
-    """The JSON header of the GLB file at `path`, and the surfaces of its default scene, placed in the world.
+def read_glb(path: Path) -> trimesh.Scene:
+    """The surfaces of the default scene of the GLB file at `path`, in the world frame.
 
-    A mesh per primitive and node, ordered as the primitives are in the file. Besides what trimesh knows, a mesh has
+    One mesh per primitive and node, in the file's order of primitives. Besides trimesh's own attributes a mesh has
     `vertex_attributes[RAW_UV]` ((V, 2) float32, v down, texture transform applied), `vertex_attributes[TINT]`
-    ((V, 4) float32, linear: vertex colour times base colour; absent where that is white), and in its `metadata` the
-    sampler's `wrap` modes (of u, of v) and `unlit`. Images are opened, not decoded. A file that is missing, cut
-    short, no GLB 2, compressed, without triangles, not finite, that requires an extension not known here, or whose
-    base colours are neither PNG, JPEG nor WebP, is an `InputError`.
+    ((V, 4) float32, linear: vertex colour times base colour; absent if white), and in its `metadata` the sampler's
+    `wrap` modes (of u, of v) and `unlit`. Images are opened, not decoded. A file is an `InputError` if it is missing,
+    truncated, not GLB 2, compressed, not finite, without triangles, requires an unknown extension, or has base colours
+    in another format than PNG, JPEG or WebP.
     """
     try:
         content = Path(path).read_bytes()
@@ -64,20 +64,20 @@ def read_glb(path: Path) -> tuple[dict[str, Any], trimesh.Scene]:
         meshes = [_mesh(surface) for surface in surfaces]
     except InputError:
         raise
-    except Exception as error:  # JSON of the wrong types, and what PIL raises for a broken image
+    except Exception as error:  # JSON with wrong types, and PIL's many kinds of error for a damaged image
         found = " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(f"{path}: expected a readable GLB file, found {found}") from error
     if sum(len(mesh.faces) for mesh in meshes) == 0:
         raise InputError(f"{path}: expected a mesh, found no triangles")
     scene = trimesh.Scene()
     scene.geometry.update((f"{index:06d}", mesh) for index, mesh in enumerate(meshes))
-    for name in reversed(scene.geometry):  # the order of textures in an atlas, and so the last bits of a photograph
+    for name in reversed(scene.geometry):  # the order of textures in an atlas determines the last bits of a photograph
         scene.graph.update(frame_to=name, geometry=name)
-    return header, scene
+    return scene
 
 
 def _mesh(surface: Surface) -> trimesh.Trimesh:
-    """A surface as trimesh has it; the material of one without is white."""
+    """A surface as trimesh's mesh; without a material it is white."""
     material = surface.material or Material()
     attributes, visual = {}, None
     if surface.uv is not None:
@@ -105,26 +105,25 @@ def _mesh(surface: Surface) -> trimesh.Trimesh:
 
 
 def placed_meshes(scene: trimesh.Scene) -> Iterator[tuple[trimesh.Trimesh, np.ndarray, np.ndarray]]:
-    """Each mesh of `scene`, its vertices ((V, 3) float32, world) and faces ((F, 3)); in the order of the geometries."""
+    """Each mesh of `scene`, its vertices ((V, 3) float32, world) and faces ((F, 3)), in the order of the geometries."""
     order = {name: index for index, name in enumerate(scene.geometry)}
     placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
-    for world_T_mesh, name in sorted(placed, key=lambda place: order[place[1]]):
+    for world_T_mesh, name in sorted(placed, key=lambda node: order[node[1]]):
         mesh = scene.geometry[name]
         if not isinstance(mesh, trimesh.Trimesh):
             continue
         vertices, faces = mesh.vertices.view(np.ndarray), mesh.faces.view(np.ndarray)
         if not np.array_equal(world_T_mesh, np.eye(4)):
             vertices = trimesh.transform_points(vertices, world_T_mesh)
-            if np.linalg.det(world_T_mesh[:3, :3]) < 0:  # a mirrored mesh keeps its front faces
+            if np.linalg.det(world_T_mesh[:3, :3]) < 0:  # mirroring swaps front and back
                 faces = faces[:, ::-1]
         yield mesh, vertices.astype(np.float32), faces
 
 
 def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> None:
-    """Write `primitives` as a GLB 2 file, a mesh and a node each. Same input, same bytes.
+    """Write `primitives` as a GLB 2 file, with a mesh and a node per primitive. Same input, same bytes.
 
-    `nearest` asks for nearest, clamped sampling of the images; else the file says no more than the wrap modes, and
-    nothing at all where they repeat.
+    With `nearest`, images have nearest, clamped sampling; else samplers only have wrap modes, and repeated images none.
     """
     header: dict[str, Any] = {"asset": {"version": "2.0", "generator": "zerobev"}, "scene": 0}
     for key in ("nodes", "meshes", "materials", "accessors", "bufferViews", "images", "textures"):
@@ -135,7 +134,7 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
     if any(primitive.unlit for primitive in primitives):
         header["extensionsUsed"] = ["KHR_materials_unlit"]
     binary = bytearray()
-    texture_of: dict[tuple[int, tuple[int, int]], int] = {}  # by identity: equal charts remain two
+    texture_of: dict[tuple[int, tuple[int, int]], int] = {}  # by identity: equal images of two charts stay separate
     for index, primitive in enumerate(primitives):
         attributes = {"POSITION": _add_array(header, binary, primitive.positions, _FLOAT, bounds=True)}
         if primitive.uv is not None:
@@ -147,13 +146,13 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
         header["meshes"].append({"name": primitive.name, "primitives": [triangles]})
         header["nodes"].append({"name": primitive.name, "mesh": index})
         if primitive.colors is not None and primitive.image is None and primitive.alpha_mode == "OPAQUE":
-            continue  # readers (trimesh is one) take the white of a material for the colour
+            continue  # readers such as trimesh would use the material's white
         texture = None
         if primitive.image is not None:
-            place = id(primitive.image), primitive.wrap
-            if place not in texture_of:
-                texture_of[place] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
-            texture = texture_of[place]
+            sampled = id(primitive.image), primitive.wrap
+            if sampled not in texture_of:
+                texture_of[sampled] = _add_image(header, binary, primitive.image, None if nearest else primitive.wrap)
+            texture = texture_of[sampled]
         triangles["material"] = len(header["materials"])
         header["materials"].append(_material(primitive, texture))
     header["buffers"] = [{"byteLength": len(binary)}]
@@ -162,14 +161,14 @@ def write_glb(path: Path, primitives: Sequence[Primitive], nearest: bool) -> Non
 
 
 def _header(path: Path, content: bytes) -> tuple[dict[str, Any], int]:
-    """The JSON chunk, and where it ends; every length in the file is checked against the file's own."""
+    """The JSON chunk and the offset of its end; the header's length has to be the file's."""
     if len(content) < 20 or content[:4] != _MAGIC:
         raise InputError(f"{path}: expected a GLB file, found {len(content)} bytes that start with {content[:4]!r}")
     version, length, size, kind = struct.unpack_from("<IIII", content, 4)
     if version != _VERSION or kind != _JSON:
         raise InputError(f"{path}: expected GLB version 2 with a JSON header, found version {version}")
     if length != len(content):
-        raise InputError(f"{path}: expected {length} bytes, as its header says, found {len(content)}")
+        raise InputError(f"{path}: expected {length} bytes, by its header, found {len(content)}")
     try:
         header = json.loads(content[20 : 20 + size])
     except (ValueError, RecursionError) as error:
@@ -180,7 +179,7 @@ def _header(path: Path, content: bytes) -> tuple[dict[str, Any], int]:
 
 
 def _container(header: dict[str, Any], rest: bytes) -> bytes:
-    """A GLB file of a JSON header and the chunks after it."""
+    """A GLB file with a JSON header, followed by `rest`."""
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     return struct.pack("<4sIIII", _MAGIC, _VERSION, 20 + len(text) + len(rest), len(text), _JSON) + text + rest
@@ -208,7 +207,7 @@ def _add_view(header: dict[str, Any], binary: bytearray, content: bytes) -> int:
 
 
 def _add_array(header: dict[str, Any], binary: bytearray, array: np.ndarray, kind: int, bounds: bool = False) -> int:
-    """Index of a new accessor of `array`, stored as `kind`; positions need their bounds."""
+    """Index of a new accessor for `array`, stored as `kind`; positions need bounds."""
     stored = array.astype({_FLOAT: "<f4", _UINT16: "<u2", _UINT32: "<u4"}[kind])
     form = "SCALAR" if stored.ndim == 1 else f"VEC{stored.shape[1]}"
     view = _add_view(header, binary, stored.tobytes())
@@ -222,7 +221,7 @@ def _add_array(header: dict[str, Any], binary: bytearray, array: np.ndarray, kin
 
 
 def _add_image(header: dict[str, Any], binary: bytearray, image: bytes, wrap: tuple[int, int] | None) -> int:
-    """Index of a new texture of `image`, an encoded file; without `wrap` it has the sampler that stands first."""
+    """Index of a new texture for `image`, an encoded file; without `wrap` it has sampler 0."""
     kind = "image/png" if image.startswith(b"\x89PNG") else "image/jpeg"
     header["images"].append({"bufferView": _add_view(header, binary, image), "mimeType": kind})
     texture = {"source": len(header["images"]) - 1}

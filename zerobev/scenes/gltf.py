@@ -1,6 +1,6 @@
-"""Surfaces of a glTF 2.0 file: its primitives, materials and nodes, read as the specification says.
+"""Surfaces of a glTF 2.0 file: its primitives, materials and nodes, read by the specification.
 
-trimesh has no second set of texture coordinates, no texture transforms, samplers, instances and triangle fans.
+trimesh does not read second sets of texture coordinates, texture transforms, samplers, instances and triangle fans.
 """
 
 import io
@@ -21,13 +21,13 @@ _INSTANCES, _TRANSFORM, _UNLIT = "EXT_mesh_gpu_instancing", "KHR_texture_transfo
 _SPECULAR, _WEBP = "KHR_materials_pbrSpecularGlossiness", "EXT_texture_webp"
 EXTENSIONS = (_INSTANCES, _WEBP, _SPECULAR, _UNLIT, "KHR_mesh_quantization", _TRANSFORM)
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_IMAGES = ("PNG", "JPEG", "WEBP")  # PIL would open a PostScript file as well, and run it
-_MOST_VERTICES = 1 << 25  # of a scene: instances cost a file little
+_IMAGES = ("PNG", "JPEG", "WEBP")  # PIL would also open PostScript files, and execute them
+_MAX_VERTICES = 1 << 25  # of a scene: a short file could have many instances
 
 
 @dataclass(frozen=True)
 class Material:
-    """The look of a surface, of those properties that are used."""
+    """The properties of a material that are used."""
 
     image: Image.Image | None = None  #: opened, not decoded
     uv_set: int = 0
@@ -42,17 +42,17 @@ class Material:
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles of one primitive at one node, in the world."""
+    """Triangles of one primitive at one node, in the world frame."""
 
     vertices: np.ndarray  #: (V, 3) float32, metres
     faces: np.ndarray  #: (F, 3) int64, counter-clockwise as seen from the front
-    uv: np.ndarray | None  #: (V, 2) float32, v down, of the image; None without an image
+    uv: np.ndarray | None  #: (V, 2) float32, v down; None without an image
     colors: np.ndarray | None  #: (V, 4) float32, linear RGBA, multiplied with the base colour
-    material: Material | None  #: None: the file names none
+    material: Material | None  #: None if the file names none
 
 
 class Asset:
-    """One glTF asset, of its JSON header and the binary chunk beside it."""
+    """One glTF asset, from its JSON header and binary chunk."""
 
     def __init__(self, path: Path, header: dict[str, Any], binary: bytes) -> None:
         self._file, self._header = Accessors(path, header, binary), header
@@ -64,7 +64,7 @@ class Asset:
 
     def surfaces(self) -> list[Surface]:
         """Every surface of the default scene, ordered by mesh and by primitive."""
-        placed = sorted(self._placed_meshes(), key=lambda place: place[0])
+        placed = sorted(self._placed_meshes(), key=lambda mesh: mesh[0])
         found: list[Surface] = []
         total = 0
         for mesh, world_T_copies in placed:
@@ -73,8 +73,8 @@ class Asset:
                 if shape is None:
                     continue
                 total += len(shape.vertices) * len(world_T_copies)
-                if total > _MOST_VERTICES:
-                    raise self._file.error(f"at most {_MOST_VERTICES} vertices", "more")
+                if total > _MAX_VERTICES:
+                    raise self._file.error(f"at most {_MAX_VERTICES} vertices", "more")
                 found.append(_placed(shape, world_T_copies))
         return found
 
@@ -92,7 +92,7 @@ class Asset:
         return self._images[index]
 
     def _material(self, index: int) -> Material:
-        """A material; of its textures only the base colour."""
+        """A material; only its base colour has a texture."""
         if index not in self._materials:
             material = self._file.item("materials", index)
             surface, extensions = material.get("pbrMetallicRoughness", {}), material.get("extensions", {})
@@ -116,7 +116,7 @@ class Asset:
         return self._materials[index]
 
     def _texture(self, info: dict[str, Any]) -> dict[str, Any]:
-        """The fields of a `Material` that come from its texture."""
+        """The fields of a `Material` that depend on its texture."""
         texture = self._file.item("textures", info["index"])
         source = texture.get("extensions", {}).get(_WEBP, texture).get("source")
         if source is None:
@@ -131,11 +131,11 @@ class Asset:
         if transform is not None:
             uv_set = transform.get("texCoord", uv_set)
             cosine, sine = np.cos(transform.get("rotation", 0.0)), np.sin(transform.get("rotation", 0.0))
-            # v runs down: counter-clockwise turns u towards -v (the listing in the extension's text turns the other
-            # way, its example and all viewers this way)
-            turn = np.array([[cosine, sine], [-sine, cosine]])
+            # v points down, so counter-clockwise rotates u towards -v, as in the extension's example and all viewers;
+            # the listing in the extension's text rotates the other way
+            rotation = np.array([[cosine, sine], [-sine, cosine]])
             matrix = np.empty((2, 3))
-            matrix[:, :2] = turn * transform.get("scale", (1, 1))
+            matrix[:, :2] = rotation * transform.get("scale", (1, 1))
             matrix[:, 2] = transform.get("offset", (0, 0))
         return {"image": self._image(source), "uv_set": uv_set, "uv_matrix": matrix, "wrap": wrap}
 
@@ -191,8 +191,8 @@ class Asset:
         if mode != _STRIP:
             raise self._file.error("a mode from 0 to 6", repr(mode)[:40])
         faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
-        faces[1::2] = faces[1::2, ::-1]  # every other triangle of a strip runs the other way round
-        repeated = (faces == np.roll(faces, 1, axis=1)).any(axis=1)  # they join pieces of a strip
+        faces[1::2] = faces[1::2, ::-1]  # every other triangle of a strip has the opposite orientation
+        repeated = (faces == np.roll(faces, 1, axis=1)).any(axis=1)  # degenerate triangles join pieces of a strip
         return faces[~repeated]
 
     # --- nodes -------------------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ class Asset:
             raise self._file.error("rigid meshes", f"{'a skin' if 'skin' in node else 'a morph target'} on one")
 
     def _copies(self, node: dict[str, Any]) -> np.ndarray:
-        """(N, 4, 4): transforms of the copies of a node's mesh to the node; one that does nothing without copies."""
+        """(N, 4, 4) transforms of the copies of a node's mesh to the node; one identity without instances."""
         instances = node.get("extensions", {}).get(_INSTANCES)
         if instances is None:
             return np.eye(4)[None]
@@ -233,8 +233,8 @@ class Asset:
         if len(counts) != 1:
             raise self._file.error("instances with attributes of one length", str(sorted(counts)))
         (count,) = counts
-        if count > _MOST_VERTICES // 16:
-            raise self._file.error(f"at most {_MOST_VERTICES // 16} instances", str(count))
+        if count > _MAX_VERTICES // 16:
+            raise self._file.error(f"at most {_MAX_VERTICES // 16} instances", str(count))
         transforms = np.tile(np.eye(4), (count, 1, 1))
         for n in range(count):
             transforms[n] = _local_transform({name.lower(): array[n] for name, array in arrays.items()})
@@ -242,9 +242,9 @@ class Asset:
 
 
 def rgba(image: Image.Image) -> np.ndarray:
-    """(rows, columns, 4) uint8 texels of an image of any kind; those of 16 bits are rounded to 8.
+    """(rows, columns, 4) uint8 texels of an image of any mode; 16 bits are rounded to 8.
 
-    A broken image raises what PIL raises.
+    Raises PIL's errors for a damaged image.
     """
     if image.mode.startswith("I"):
         grey = np.rint(np.asarray(image) / 257).astype(np.uint8)
@@ -253,7 +253,7 @@ def rgba(image: Image.Image) -> np.ndarray:
 
 
 def _local_transform(node: dict[str, Any]) -> np.ndarray:
-    """(4, 4) transform of a node to its parent, of a matrix or of translation, rotation and scale."""
+    """(4, 4) transform of a node to its parent, from a matrix or from translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     transform = np.eye(4)
@@ -265,15 +265,15 @@ def _local_transform(node: dict[str, Any]) -> np.ndarray:
 
 
 def _placed(shape: Surface, world_T_copies: np.ndarray) -> Surface:
-    """All copies of a shape in the world; a mirrored one keeps its front faces."""
+    """All copies of a shape in the world frame; the order of corners is reversed in mirrored ones."""
     vertices, faces = [], []
     for copy, world_T_mesh in enumerate(world_T_copies):
-        place = shape.vertices
+        positions = shape.vertices
         if not np.array_equal(world_T_mesh, np.eye(4)):
-            place = trimesh.transform_points(place.astype(np.float64), world_T_mesh).astype(np.float32)
+            positions = trimesh.transform_points(positions.astype(np.float64), world_T_mesh).astype(np.float32)
         mirrored = np.linalg.det(world_T_mesh[:3, :3]) < 0
-        vertices.append(place)
-        faces.append((shape.faces[:, ::-1] if mirrored else shape.faces) + copy * len(place))
+        vertices.append(positions)
+        faces.append((shape.faces[:, ::-1] if mirrored else shape.faces) + copy * len(positions))
     count = len(world_T_copies)
     uv, colors = (None if a is None else np.tile(a, (count, 1)) for a in (shape.uv, shape.colors))
     return Surface(np.concatenate(vertices), np.concatenate(faces), uv, colors, shape.material)

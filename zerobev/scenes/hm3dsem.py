@@ -1,8 +1,8 @@
-"""Homes in the format of HM3DSem v0.2: which there are, how they are split, and one of them as a `Scene`.
+"""Reader of HM3DSem v0.2: finds scenes, splits them, and reads one as a `Scene`.
 
-A dataset is a folder with `train`, `val` and perhaps `minival`; a scene is a folder `NNNNN-HASH` in one of
-them, with `HASH.glb` (the photograph), `HASH.semantic.glb` (the annotation) and `HASH.semantic.txt` (the names).
-Variants with Basis textures are ignored. `hm3dsem_writer` writes the same.
+A data set is a folder with `train`, `val` and optionally `minival`; a scene is a folder `NNNNN-HASH` in one of them,
+with `HASH.glb` (the photograph), `HASH.semantic.glb` (the annotation) and `HASH.semantic.txt` (the names). Variants
+with Basis textures are ignored. `hm3dsem_writer` writes the same format.
 """
 
 import logging
@@ -29,8 +29,8 @@ _SPLITS = ("train", "val", "minival")
 _MINIVAL = ("00800", "00802", "00803", "00808")
 _ROW = re.compile(r'([0-9]{1,5}),([0-9A-Fa-f]{6}),"(.*)",(-?[0-9]{1,9})')
 _ROW_FORM = 'id,RRGGBB,"name",region'
-_LARGEST_ID = 65535
-_ROWS_SHOWN = 5  # of the bad rows of a file
+_MAX_ID = 65535
+_MAX_ROWS_SHOWN = 5  # bad rows in a message
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,6 @@ class SceneFolders:
     train: tuple[Path, ...]
     validation: tuple[Path, ...]
     test: tuple[Path, ...]
-    dealt: bool = False  #: not the official split: there were too few homes for it
 
     def of(self, split: Split) -> tuple[Path, ...]:
         """The folders of one split."""
@@ -48,7 +47,7 @@ class SceneFolders:
 
 
 def hash_of(folder: Path) -> str:
-    """The part of a scene folder's name that its files are called by; a name of another form is an `InputError`."""
+    """The part of a scene folder's name in its files' names; a folder name of another form is an `InputError`."""
     match = re.fullmatch(r"[0-9]{5}-(\w+)", Path(folder).name)
     if match is None:
         raise InputError(f"{folder}: expected a scene folder named NNNNN-HASH, found {Path(folder).name!r}")
@@ -58,7 +57,7 @@ def hash_of(folder: Path) -> str:
 def find_scenes(root: Path) -> dict[str, list[Path]]:
     """The annotated scene folders in `train`, `val` and `minival` of `root`, sorted by name; lists may be empty.
 
-    A scene is annotated if it has both semantic files. None at all is an `InputError`.
+    A scene is annotated if it has both semantic files. If none is found, it is an `InputError`.
     """
     root = Path(root)
     if not root.is_dir():
@@ -73,47 +72,46 @@ def find_scenes(root: Path) -> dict[str, list[Path]]:
 
 
 def split_scenes(root: Path) -> SceneFolders:
-    """Split the scenes of `root` as the paper does, or deal them out where that is not possible.
+    """Split the scenes of `root` as the paper does, or by name if that is not possible.
 
-    The paper's split (section "Experimental Results"): training on `train`; validation on the four annotated
-    scenes of `minival` (taken from `val` where there is no such folder); test on the rest of `val`.
+    The paper's split (section "Experimental Results"): training on `train`; validation on the four annotated scenes of
+    `minival` (taken from `val` if that folder is missing); test on the rest of `val`.
 
-    Where one of the three would be empty all scenes are dealt out, sorted by name: of n scenes the last
-    max(1, n // 5) are for test, the one before them for validation, and the others for training. With two
-    scenes the training home serves validation too, by its own other views. One scene is an `InputError`.
+    If one of the three would be empty, all scenes are sorted by name: of n scenes the last max(1, n // 5) are for test,
+    the one before them for validation, and the others for training. Of two scenes the training scene is also the
+    validation scene, with other views. One scene is an `InputError`.
     """
     found = find_scenes(root)
     validation = found["minival"] or [folder for folder in found["val"] if folder.name[:5] in _MINIVAL]
     names = {folder.name for folder in validation}
     test = [folder for folder in found["val"] if folder.name not in names]
     if found["train"] and validation and test:
-        return SceneFolders(tuple(found["train"]), tuple(validation), tuple(test), dealt=False)
+        return SceneFolders(tuple(found["train"]), tuple(validation), tuple(test))
     by_name = {folder.name: folder for split in _SPLITS for folder in found[split]}
     scenes = tuple(by_name[name] for name in sorted(by_name))
     if len(scenes) < 2:
-        raise InputError(f"{root}: expected two annotated scenes at least, for training and for test, found one")
+        raise InputError(f"{root}: expected at least two annotated scenes, for training and for test, found one")
     tests = max(1, len(scenes) // 5)
     if len(scenes) == 2:
-        return SceneFolders(scenes[:1], scenes[:1], scenes[1:], dealt=True)
-    return SceneFolders(scenes[: -tests - 1], scenes[-tests - 1 : -tests], scenes[-tests:], dealt=True)
+        return SceneFolders(scenes[:1], scenes[:1], scenes[1:])
+    return SceneFolders(scenes[: -tests - 1], scenes[-tests - 1 : -tests], scenes[-tests:])
 
 
 def read_scene(folder: Path) -> Scene:
     """The scene in `folder`, named after it.
 
-    Faces keep the file's order; charts are in the order of their first face. Texels whose colour belongs to no
-    instance get id 0; if these are more than a few per cent of the surface, it is an `InputError`. So is a mesh of the
-    annotation without a texture (textures for the surface need the atlas), every broken or missing file, and a home
-    that is not in metres with z up (`check_extents`).
+    Faces are in the file's order, charts in the order of their first face. Texels with a colour of no instance get id
+    0; on more than 5 % of the surface they are an `InputError`. So are a mesh of the annotation without a texture (it
+    defines the atlas), a broken or missing file, and a scene that is not in metres with z up (`check_extents`).
     """
     folder = Path(folder)
     stem = hash_of(folder)
-    instances, bad_rows = _read_rows(folder / f"{stem}.semantic.txt")
+    instances, bad_rows = read_instances(folder / f"{stem}.semantic.txt")
     path = folder / f"{stem}.semantic.glb"
-    _, annotation = read_glb(path)
+    annotation = read_glb(path)
     atlas = _read_atlas(path, annotation, instances, bad_rows)
     photograph_path = folder / f"{stem}.glb"
-    _, photograph = read_glb(photograph_path)
+    photograph = read_glb(photograph_path)
     unlit = any(mesh.metadata["unlit"] for mesh in photograph.geometry.values())
     for mesh in photograph.geometry.values():
         image = _texture(mesh)
@@ -124,21 +122,16 @@ def read_scene(folder: Path) -> Scene:
     return scene
 
 
-def read_instances(path: Path) -> tuple[Instance, ...]:
-    """The rows of a `.semantic.txt`, sorted by id, with the labels of their names.
+def read_instances(path: Path) -> tuple[tuple[Instance, ...], int]:
+    """The rows of a `.semantic.txt`, sorted by id, with the labels of their names; and the number of left-out rows.
 
-    The form is a first line `HM3D Semantic Annotations`, then `id,RRGGBB,"name",region` in each line; a name may
-    hold commas and quotes. Ids are 1 to 65535; ids and colours are unique, and black is "unknown".
+    The first line is `HM3D Semantic Annotations`, each further line `id,RRGGBB,"name",region`; names may contain commas
+    and quotes. Ids are 1 to 65535; ids and colours are unique, and black means "unknown".
 
-    A row of another form, or with the id of an earlier row, is left out, and two rows of one colour are left out both:
-    their surface has id 0, "unknown". One warning on the log "zerobev.scenes" lists them. A file without a good row,
-    without the first line, or that cannot be read, is an `InputError`.
+    A row of another form, or with the id of an earlier row, is left out; two rows with the same colour are both left
+    out. Their surfaces have id 0, "unknown". One warning on the log "zerobev.scenes" lists them. A file without a good
+    row, without the first line, or that cannot be read, is an `InputError`.
     """
-    return _read_rows(Path(path))[0]
-
-
-def _read_rows(path: Path) -> tuple[tuple[Instance, ...], int]:
-    """As `read_instances`, with the number of rows that were left out."""
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
     except OSError as error:
@@ -154,7 +147,7 @@ def _read_rows(path: Path) -> tuple[tuple[Instance, ...], int]:
             continue
         instance = _instance(row)
         if instance is not None and instances.get(instance.id) == instance:
-            continue  # the row of before, once more
+            continue  # an exact duplicate
         if instance is None or instance.id in instances or instance.color in id_of_color:
             bad.append(f"line {number}, {row.encode(errors='backslashreplace').decode()[:80]!r}")
             if instance is not None:
@@ -163,9 +156,9 @@ def _read_rows(path: Path) -> tuple[tuple[Instance, ...], int]:
         id_of_color[instance.color] = instance.id
         instances[instance.id] = instance
     if bad:
-        expected = f"{_ROW_FORM} with UTF-8, an id from 1 to {_LARGEST_ID}, and ids and colors not used twice"
-        more = f" and {len(bad) - _ROWS_SHOWN} more" if len(bad) > _ROWS_SHOWN else ""
-        message = f"{path}: expected {expected}, found {'; '.join(bad[:_ROWS_SHOWN])}{more}"
+        expected = f"{_ROW_FORM} with UTF-8, an id from 1 to {_MAX_ID}, and ids and colors not used twice"
+        more = f" and {len(bad) - _MAX_ROWS_SHOWN} more" if len(bad) > _MAX_ROWS_SHOWN else ""
+        message = f"{path}: expected {expected}, found {'; '.join(bad[:_MAX_ROWS_SHOWN])}{more}"
         if not instances:
             raise InputError(message)
         log.warning("%s: their surfaces are unknown", message)
@@ -176,7 +169,7 @@ def _instance(row: str) -> Instance | None:
     """The instance of one row of a `.semantic.txt`, or None for a row of another form."""
     match = _ROW.fullmatch(row)
     is_utf8 = not any("\ud800" <= character <= "\udfff" for character in row)
-    if match is None or not is_utf8 or not 1 <= int(match[1]) <= _LARGEST_ID:
+    if match is None or not is_utf8 or not 1 <= int(match[1]) <= _MAX_ID:
         return None
     red, green, blue = bytes.fromhex(match[2])
     return Instance(int(match[1]), (red, green, blue), match[3], int(match[4]), label_of(match[3]))
@@ -188,7 +181,7 @@ def _is_annotated(folder: Path) -> bool:
 
 
 def _read_atlas(path: Path, annotation: trimesh.Scene, instances: tuple[Instance, ...], bad_rows: int) -> dict:
-    """The fields of a `Scene` that come from the annotation's mesh and textures."""
+    """The fields of a `Scene` from the annotation's mesh and textures."""
     id_of_color = np.zeros(1 << 24, np.uint16)
     for instance in instances:
         red, green, blue = instance.color
@@ -218,5 +211,5 @@ def _texture(mesh: trimesh.Geometry) -> Image.Image | None:
 def _check_texture(path: Path, image: Image.Image) -> None:
     try:
         image.load()
-    except Exception as error:  # PIL raises OSError, SyntaxError, ValueError, ... for a broken image
+    except Exception as error:  # PIL raises many kinds of error for a damaged image
         raise InputError(f"{path}: expected readable textures, found one that is not: {error}") from error

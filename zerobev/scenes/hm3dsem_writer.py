@@ -1,4 +1,4 @@
-"""Write scenes in the format of HM3DSem v0.2, as `hm3dsem` reads them."""
+"""Writes scenes in the format of HM3DSem v0.2, for `hm3dsem` to read."""
 
 import io
 import os
@@ -26,15 +26,15 @@ _JPEG_QUALITY = 90
 def write_scene(folder: Path, scene: Scene) -> None:
     """Write `scene` to `folder` (`NNNNN-HASH`) as `HASH.glb`, `HASH.semantic.glb` and `HASH.semantic.txt`.
 
-    Annotation colours are kept twice, as HM3DSem does: as raw sRGB bytes in the texture, and as linear vertex
-    colours. The annotation is lossless (PNG); the photograph's textures are JPEG, those with transparency PNG.
-    What `read_scene` gives back has the faces grouped by chart, and by sidedness within it, in their order; vertices
-    appear once for every chart, UV coordinate and instance that they are used with, in their order, and unused ones
-    not at all; charts without a face are left out. A scene in that form already comes back as it was, bit for bit,
-    apart from the compression of the photograph.
+    Annotation colours are stored twice, as in HM3DSem: as raw sRGB bytes in the texture, and as linear vertex colours.
+    The annotation is lossless (PNG); the photograph's textures are JPEG, or PNG if transparent.
 
-    The folder appears whole or not at all, and replaces an earlier scene of the same files. A folder with other
-    files in it is an `InputError`, and so are a bad folder name and an instance name that is no single line.
+    In the scene that `read_scene` returns, faces are grouped by chart, then by sidedness. There is one vertex for each
+    combination of vertex, chart, UV coordinate and instance in use; unused vertices and charts are left out. A scene in
+    that form is read back bit for bit, except for the compression of the photograph.
+
+    The folder is written atomically and replaces an earlier scene. A folder with other files, a bad folder name and an
+    instance name of several lines are `InputError`s.
     """
     folder = Path(folder)
     stem = hash_of(folder)
@@ -47,7 +47,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
 
 def write_dataset_config(root: Path, scenes: Iterable[Path]) -> None:
-    """Write the scene dataset configuration by which Habitat finds `scenes` (folders within `root`)."""
+    """Write Habitat's configuration of the data set at `root` with `scenes`, folders in it."""
     root = Path(root)
     stages = [(folder / f"{hash_of(folder)}.glb").relative_to(root).as_posix() for folder in map(Path, scenes)]
     same_name = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
@@ -70,7 +70,7 @@ def write_dataset_config(root: Path, scenes: Iterable[Path]) -> None:
 
 
 def srgb_to_linear(color: np.ndarray) -> np.ndarray:
-    """Linear colour, 16-bit normalised (uint16), of sRGB bytes (any shape)."""
+    """sRGB bytes (any shape) to linear colour, 16-bit normalised (uint16)."""
     srgb = np.asarray(color) / 255
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.round(linear * 65535).astype(np.uint16)
@@ -84,7 +84,7 @@ def _row(instance: Instance) -> str:
 
 
 def _annotation_primitives(scene: Scene) -> Iterator[Primitive]:
-    """One primitive per chart, or two that share the chart's image where a part of its faces is double-sided."""
+    """One primitive per chart, or two with the same image if some of its faces are double-sided."""
     colors = np.zeros((len(scene.instance_label), 3), np.uint8)
     for instance in scene.instances:
         colors[instance.id] = instance.color
@@ -111,9 +111,9 @@ def _annotation_primitives(scene: Scene) -> Iterator[Primitive]:
 
 
 def _shared_corners(vertex: np.ndarray, uv: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of faces that agree in vertex, UV and instance become one: GLB has one of each to a vertex.
+    """Merge corners of faces with the same vertex, UV and instance: GLB has one of each per vertex.
 
-    Returns one corner for each group, ordered by vertex, and the faces ((F, 3)) over these groups.
+    Returns one corner per group, ordered by vertex, and the faces ((F, 3)) over these groups.
     """
     keys = (uv.view(np.uint64).reshape(-1), vertex.astype(np.uint64) << np.uint64(16) | ids)
     order = np.lexsort(keys)
@@ -125,7 +125,7 @@ def _shared_corners(vertex: np.ndarray, uv: np.ndarray, ids: np.ndarray) -> tupl
 
 
 def _photograph_primitives(scene: Scene) -> Iterator[Primitive]:
-    """One primitive a mesh, placed in the world."""
+    """One primitive per mesh, in the world frame."""
     encoded: dict[int, bytes] = {}
     for index, (mesh, positions, faces) in enumerate(placed_meshes(scene.photograph)):
         uv, colors, image, double_sided = None, None, None, bool(np.any(scene.double_sided))
@@ -178,7 +178,7 @@ def _encoded(image: Image.Image, kind: str, **options: int) -> bytes:
 
 @contextmanager
 def _replacing_folder(folder: Path, names: list[str]) -> Iterator[Path]:
-    """Give a temporary folder beside `folder`; on success move it there, on any error remove it."""
+    """Yield a temporary folder beside `folder`; on success rename it to `folder`, on any error remove it."""
     if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - set(names)):
         raise InputError(f"{folder}: expected no folder, or a scene of {', '.join(names)}, found other files")
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")

@@ -1,7 +1,7 @@
 """Write a data set of generated homes, in HM3DSem layout.
 
-Reads nothing; writes `train/`, `minival/` and `val/` with a folder per home into `--out`. Home number n of a seed is
-the same home at every scale; homes that are there already stay.
+Reads nothing; writes `train/`, `minival/` and `val/` with a folder per home into `--out`. Home n of a seed is the same
+at every scale. Existing homes are not written again.
 """
 
 import argparse
@@ -21,7 +21,7 @@ _FIRST = {"train": 0, "minival": 800, "val": 1000}
 
 
 def home_folders(root: Path, scenes: SceneConfig) -> SceneFolders:
-    """Where the homes of each split belong, written or not."""
+    """The folders of the homes of each split, written or not."""
 
     def folders(part: str, count: int) -> tuple[Path, ...]:
         return tuple(root / part / f"{n:05d}-Home{n:07d}" for n in range(_FIRST[part], _FIRST[part] + count))
@@ -31,7 +31,7 @@ def home_folders(root: Path, scenes: SceneConfig) -> SceneFolders:
 
 
 def ensure_home(folder: Path, seed: int) -> Path:
-    """Generate and write the home that belongs in `folder`, unless it is there."""
+    """Generate and write the home of `folder`, unless it exists."""
     if not folder.exists():
         number = int(folder.name.split("-")[0])
         home = generate_home(folder.name.split("-")[1], np.random.default_rng([seed, number]))
@@ -40,7 +40,7 @@ def ensure_home(folder: Path, seed: int) -> Path:
 
 
 def ensure_homes(folders: list[Path], seed: int, workers: int) -> None:
-    """Generate the homes of `folders` that are missing, in parallel."""
+    """Generate the missing homes of `folders`, in parallel."""
     missing = [folder for folder in folders if not folder.exists()]
     jobs = (joblib.delayed(ensure_home)(folder, seed) for folder in missing)
     for _ in run_jobs(jobs, workers, "homes", len(missing)):
@@ -48,7 +48,7 @@ def ensure_homes(folders: list[Path], seed: int, workers: int) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of `zerobev homes`."""
+    """Add the arguments of `zerobev homes`."""
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, in HM3DSem layout")
     parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
     parser.add_argument("--seed", type=int, default=0)

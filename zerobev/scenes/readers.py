@@ -1,4 +1,4 @@
-"""Data sets that scenes are read from. A new one is a module with the functions of `Reader`, and one line here."""
+"""Readers of data sets. A new data set is a module with the functions of `Reader`, and one line here."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +10,10 @@ from zerobev.scenes.scene import Scene
 
 
 class Reader(Protocol):
-    """The functions of a module that reads one data set; they raise `InputError` for broken or missing files."""
+    """The functions of a data set's module; they raise `InputError` for broken or missing files."""
 
     def find_scenes(self, root: Path) -> dict[str, list[Path]]:
-        """The scene folders in each official part of the data set at `root`, sorted by name."""
+        """The scene folders at `root` in each official part of the data set, sorted by name."""
 
     def split_scenes(self, root: Path) -> SceneFolders:
         """The scene folders at `root` for training, validation and test."""
@@ -22,8 +22,8 @@ class Reader(Protocol):
         """The scene in `folder`, named after it."""
 
 
-#: name -> test of a folder, of a data set or of one of its scenes, and reader. The first match reads. HM3DSem matches
-#: every folder and stays last: its errors name what it misses.
+#: name -> test of a folder (of a data set or a scene), and reader; the first match is used. HM3DSem matches every
+#: folder and stays last: its errors name the missing files.
 READERS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "HM3DSem": (lambda folder: True, hm3dsem),
 }

@@ -1,4 +1,4 @@
-"""A scene: what the sensors need to know about a home, in memory."""
+"""A scene in memory: geometry, UV atlas and annotation."""
 
 import re
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from zerobev.config import NO_LABEL
 
 @dataclass(frozen=True)
 class Instance:
-    """One annotated object: a row of `.semantic.txt`, plus the class its name maps to."""
+    """One annotated object: a row of `.semantic.txt`, and the class of its name."""
 
     id: int  #: >= 1; id 0 is the implicit "unknown"
     color: tuple[int, int, int]  #: sRGB bytes, unique in the scene
@@ -23,30 +23,29 @@ class Instance:
 
 @dataclass(frozen=True)
 class Scene:
-    """Geometry, UV atlas and annotation of one home; world frame in metres, z up.
+    """Geometry, UV atlas and annotation of one scene; world frame in metres, z up.
 
-    The atlas is a tuple of charts (one texture image each). Every point of the surface has one texel
-    `(chart, row, column)`; row 0 is the top of the image. Any modality that lives on the surface is a
-    set of images of the charts' sizes, and is rendered by looking texels up.
+    The atlas is a tuple of charts, one texture image each. Every point of the surface has one texel
+    `(chart, row, column)`; row 0 is the top of the image. A modality on the surface is a set of images of the charts'
+    sizes, and is rendered by looking up texels.
 
-    The meshes of photographs and of annotations may differ (they do in HM3D's format); both are in
-    the same frame.
+    The meshes of the photograph and of the annotation may differ, as in HM3DSem; both are in the world frame.
     """
 
     name: str
     vertices: np.ndarray  #: (V, 3) float32, metres
     faces: np.ndarray  #: (F, 3) int32
-    face_uv: np.ndarray  #: (F, 3, 2) float32, u right and v down, of each corner of a face; clamped to [0, 1] per point
+    face_uv: np.ndarray  #: (F, 3, 2) float32, u right and v down, per corner of a face; points are clamped to [0, 1]
     face_chart: np.ndarray  #: (F,) int16, index into `chart_instance`
-    chart_instance: tuple[np.ndarray, ...]  #: one (rows, columns) uint16 image a chart: instance id of each texel
+    chart_instance: tuple[np.ndarray, ...]  #: one (rows, columns) uint16 image per chart: instance id of each texel
     instances: tuple[Instance, ...]  #: sorted by id
-    photograph: trimesh.Scene  #: the textured mesh that photographs are taken of
-    unlit: bool  #: light is part of the photograph's textures already
-    double_sided: bool | np.ndarray  #: whether the back of a face is visible too: of all faces, or (F,) bool
+    photograph: trimesh.Scene  #: the textured mesh for photographs
+    unlit: bool  #: light is baked into the photograph's textures
+    double_sided: bool | np.ndarray  #: whether the backs of faces are visible: one value, or (F,) bool
 
     @property
     def generated(self) -> bool:
-        """Whether this is one of the homes of `zerobev.scenes.homes`, which alone have such names."""
+        """Whether this is a home of `zerobev.scenes.homes`; only these have such names."""
         return re.fullmatch(r"([0-9]{5}-)?Home[0-9]{7}", self.name) is not None
 
     @cached_property
@@ -56,6 +55,15 @@ class Scene:
         for instance in self.instances:
             table[instance.id] = instance.label
         return table
+
+    @cached_property
+    def instance_bounds(self) -> np.ndarray:
+        """(largest id + 1, 2, 3) float64: lower and upper corner of each instance, metres; inf, -inf without faces."""
+        corner = self.vertices[self.faces].astype(np.float64)
+        lower, upper = (np.full((len(self.instance_label), 3), end) for end in (np.inf, -np.inf))
+        np.minimum.at(lower, self.face_instance, corner.min(axis=1))
+        np.maximum.at(upper, self.face_instance, corner.max(axis=1))
+        return np.stack([lower, upper], axis=1)
 
     @cached_property
     def face_instance(self) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""How full homes are, and of what: rooms, objects and classes, beside the same numbers of HM3DSem.
+"""Numbers of rooms, objects and classes in scenes, and the same numbers for HM3DSem.
 
-The reference `HM3DSEM` is of the 181 annotated scenes of HM3DSem v0.2 and their 2,599 rooms, the regions of its
-`.semantic.txt` files. HM3DSem's homes are larger than generated ones: 5, 50 and 95 % of its
-scenes have up to 42, 92 and 242 m2 of navigable floor, where generated homes have 23, 41 and 57 m2.
+The reference `HM3DSEM` describes the 181 annotated scenes of HM3DSem v0.2 with 2,599 rooms, the regions of their
+`.semantic.txt` files. HM3DSem's scenes are larger than generated homes: 5, 50 and 95 % of them have up to 42, 92 and
+242 m2 of navigable floor, generated homes 23, 41 and 57 m2.
 """
 
 from collections import Counter
@@ -18,26 +18,26 @@ from zerobev.scenes.scene import Instance
 
 @dataclass(frozen=True)
 class HomeStatistics:
-    """What a set of scenes has in its rooms; an object is any instance of a room, its walls and floor included."""
+    """Contents of the rooms of a set of scenes; objects are all instances of a room, including walls and floor."""
 
     scenes: int
     rooms: int
-    objects_mean: float  #: a room
-    objects_median: float  #: a room
-    walls: float  #: instances of class wall a room
-    share: dict[str, float]  #: of rooms that contain the class
-    mean: dict[tuple[str, str], float]  #: number in a room, by kind of room and class
+    objects_mean: float  #: per room
+    objects_median: float  #: per room
+    walls: float  #: instances of class wall per room
+    fraction: dict[str, float]  #: of the rooms with an instance of the class
+    mean: dict[tuple[str, str], float]  #: number per room, by kind of room and class
 
     @property
     def numbers(self) -> dict[str, float]:
-        """All of it as one table, by what each number is."""
+        """All numbers as one table: description -> value."""
         table = {
             "rooms a scene": self.rooms / self.scenes,
             "objects a room, mean": self.objects_mean,
             "objects a room, median": self.objects_median,
             "walls a room": self.walls,
         }
-        table |= {f"rooms with {label}": share for label, share in self.share.items()}
+        table |= {f"rooms with {label}": fraction for label, fraction in self.fraction.items()}
         return table | {f"{label} in {kind}": mean for (kind, label), mean in self.mean.items()}
 
 
@@ -47,7 +47,7 @@ HM3DSEM = HomeStatistics(
     objects_mean=46.0,
     objects_median=36.0,
     walls=8.2,
-    share={"chair": 0.36, "bed": 0.21, "toilet": 0.18, "tv": 0.15, "plant": 0.14, "sofa": 0.13},
+    fraction={"chair": 0.36, "bed": 0.21, "toilet": 0.18, "tv": 0.15, "plant": 0.14, "sofa": 0.13},
     mean={
         ("bedroom", "bed"): 1.03, ("bedroom", "chair"): 0.59, ("bedroom", "tv"): 0.22, ("bedroom", "plant"): 0.19,
         ("bathroom", "toilet"): 0.87, ("bathroom", "plant"): 0.11, ("living room", "chair"): 3.0,
@@ -61,11 +61,10 @@ HM3DSEM = HomeStatistics(
 def home_statistics(
     scenes: Sequence[Sequence[Instance]], kinds: Sequence[Sequence[str]] | None = None
 ) -> HomeStatistics:
-    """Count rooms and what is in them, in the instances of each scene; a room is a region >= 0 of a scene.
+    """Count rooms and their objects, from the instances of each scene; a room is a region >= 0 of a scene.
 
-    `kinds` holds the kind of each region of each scene, where they are known; the means by kind cover its kinds, all
-    eight classes each. Without them `mean` is empty. No room at all is an `InputError`, and so is a region
-    without a kind.
+    `kinds` holds the kind of each region of each scene, if known; `mean` then covers these kinds and all eight classes,
+    else it is empty. No room is an `InputError`, and so is a region without a kind.
     """
     rooms: dict[tuple[int, int], Counter[str]] = {}
     for number, instances in enumerate(scenes):
@@ -84,7 +83,7 @@ def home_statistics(
         objects_mean=float(np.mean(objects)),
         objects_median=float(np.median(objects)),
         walls=_mean(list(rooms.values()), "wall"),
-        share={label: float(np.mean([room[label] > 0 for room in rooms.values()])) for label in LABELS},
+        fraction={label: float(np.mean([room[label] > 0 for room in rooms.values()])) for label in LABELS},
         mean={} if kinds is None else _means_by_kind(rooms, kinds),
     )
 

@@ -38,12 +38,12 @@ def test_a_rendered_pair_is_the_looked_up_pair(scene, setting):
     agree = {"fpv": [], "bev": [], "another": []}
     for seed, pose in enumerate(POSES):
         draw = bank.draw(np.random.default_rng(seed), len(scene.chart_instance))
-        rerenderer.wear(texture_images(scene, bank, np.random.default_rng(seed)))
+        rerenderer.set_texture(texture_images(scene, bank, np.random.default_rng(seed)))
         zero, _ = rerenderer.fpv(pose)
         looked_up = bank.look_up(caster.fpv(pose, CAMERA).texel, draw)
         agree["fpv"].append((zero == looked_up).mean())
         agree["bev"].append((rerenderer.bev(pose) == bank.look_up(caster.bev(pose, CAMERA).texel, draw)).mean())
-        rerenderer.wear(texture_images(scene, bank, np.random.default_rng(seed + 10)))
+        rerenderer.set_texture(texture_images(scene, bank, np.random.default_rng(seed + 10)))
         agree["another"].append((rerenderer.fpv(pose)[0] == looked_up).mean())
     assert np.mean(agree["fpv"]) > 0.97 and np.mean(agree["bev"]) > 0.97  # except edges of squares
     assert np.mean(agree["another"]) < 0.85
@@ -51,7 +51,7 @@ def test_a_rendered_pair_is_the_looked_up_pair(scene, setting):
 
 def test_rendered_depth_is_the_cast_one(scene):
     rerenderer = Rerenderer(scene, CAMERA)
-    rerenderer.wear([np.zeros(image.shape, bool) for image in scene.chart_instance])
+    rerenderer.set_texture([np.zeros(image.shape, bool) for image in scene.chart_instance])
     for pose in POSES:
         cast = RayCaster(scene).fpv(pose, CAMERA).distance
         # samples of the rasteriser and rays differ by up to half a pixel

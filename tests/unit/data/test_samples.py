@@ -1,4 +1,4 @@
-"""Streams of tuples: functions of seed and step, aligned by the same texels, blind to what the scene means."""
+"""Streams of samples: functions of seed and step, aligned by texels, independent of the scene's classes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +39,7 @@ STREAMS = ("synth", "paper", "modsem", "depth", "semantic")
 
 @pytest.fixture(scope="module")
 def bank() -> TextureBank:
-    """Blobs of some 15 texels, 20 % white."""
+    """Blobs of about 15 texels, 20 % white."""
     noise = np.random.default_rng(0).standard_normal((4, 128, 128))
     smooth = np.array([ndimage.gaussian_filter(tile, 5, mode="wrap") for tile in noise])
     return TextureBank(smooth > np.quantile(smooth, 0.8, axis=(1, 2), keepdims=True), TEXTURE)
@@ -70,7 +70,7 @@ def stream(
 
 
 def views_of_samples(views: ViewSet, samples: list[dict]) -> list[View]:
-    """The view that each sample was made of."""
+    """The view of each sample."""
     view_of = {view.rgb.tobytes(): view for _, view in (views.locate(i) for i in range(len(views)))}
     assert len(view_of) == len(views)
     rgb = [np.moveaxis(sample["rgb"], 0, -1) for sample in samples]
@@ -81,7 +81,7 @@ def same(a: dict, b: dict) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_view_set_runs_through_its_shards(views):
+def test_view_set_indexes_its_shards_in_order(views):
     assert len(views) == sum(COUNTS)
     located = [views.locate(index) for index in range(len(views))]
     assert [shard for shard, _ in located] == [0] * 5 + [1] * 3
@@ -121,11 +121,11 @@ def test_batch_is_a_function_of_seed_and_step(views, bank, name):
     assert not same(stream(name, views, bank, seed=2, batch=4).batch(0), in_order[0])
 
 
-@pytest.mark.parametrize("ranks", [2, 3])
+@pytest.mark.parametrize("world_size", [2, 3])
 @pytest.mark.parametrize("name", STREAMS)
-def test_ranks_share_a_batch_without_overlap(views, bank, name, ranks):
+def test_ranks_share_a_batch_without_overlap(views, bank, name, world_size):
     whole = stream(name, views, bank).batch(1)
-    parts = [stream(name, views, bank).batch(1, rank, ranks) for rank in range(ranks)]
+    parts = [stream(name, views, bank).batch(1, rank, world_size) for rank in range(world_size)]
     for tensor in whole:
         together = torch.stack([part[tensor] for part in parts], dim=1).flatten(0, 1)
         assert torch.equal(together, whole[tensor])
@@ -158,19 +158,19 @@ def test_the_same_texel_has_the_same_value_in_image_and_map(views, bank, name):
         unique, inverse = np.unique(texel, axis=0, return_inverse=True)
         count, white = np.bincount(inverse.ravel()), np.bincount(inverse.ravel(), weights=value)
         assert np.isin(white / count, (0, 1)).all()
-        assert not white[unique[:, 0] < 0].any()  # no surface, no texture
+        assert not white[unique[:, 0] < 0].any()  # no texture without a surface
         in_map = np.unique(view.bev_texel.reshape(-1, 3), axis=0)
         in_image = np.unique(view.fpv_texel.reshape(-1, 3), axis=0)
         shared += len(in_map) + len(in_image) - len(unique)
     assert shared > 10
 
 
-def test_in_the_papers_mode_a_scene_wears_one_texture(views, bank):
-    """Each view looks the same in every epoch and texels the same in every view; other scenes and seeds differ."""
+def test_in_the_papers_mode_a_scene_has_one_texture(views, bank):
+    """Views are the same in every epoch, texels in every view; other scenes and seeds differ."""
     bank = TextureBank(bank.tiles, replace(bank.config, scales=(1, 5)))
 
     def white(seed: int) -> dict[tuple, set]:
-        """Values seen at each (scene, texel) in three epochs."""
+        """Values at each (scene, texel) in three epochs."""
         values: dict[tuple, set] = {}
         data = stream("paper", views, bank, seed)
         samples = [data.sample(i) for i in range(3 * len(views))]
@@ -184,7 +184,7 @@ def test_in_the_papers_mode_a_scene_wears_one_texture(views, bank):
     assert 0.1 < np.mean([first[texel] != other[texel] for texel in first]) < 0.9
     places = [texel[1:] for texel in first if texel[0] == 0 and (1, *texel[1:]) in first]
     assert 0.1 < np.mean([first[0, *place] != first[1, *place] for place in places]) < 0.9
-    # while a fresh texture differs from one epoch to the next
+    # a new texture per sample differs between epochs
     fresh = stream("synth", views, bank)
     samples = [fresh.sample(i) for i in range(2 * len(views))]
     zeros = {view.rgb.tobytes(): [] for view in views_of_samples(views, samples)}
@@ -194,15 +194,15 @@ def test_in_the_papers_mode_a_scene_wears_one_texture(views, bank):
 
 
 @pytest.mark.parametrize("name", ["synth", "modsem", "depth"])
-def test_the_asked_share_of_samples_is_blank_on_both_sides(views, bank, name):
-    """Blank samples are empty in the image and on the map; all others are those of a stream without blanks."""
-    plain, blanked = stream(name, views, bank), stream(name, views, bank, empty_fraction=0.3)
-    pairs = [(plain.sample(i), blanked.sample(i)) for i in range(200)]
-    blank = [not (new["zero"].any() or new["target"].any()) and old["zero"].any() for old, new in pairs]
-    assert 0.2 < np.mean(blank) < 0.4
+def test_the_configured_fraction_of_samples_is_empty(views, bank, name):
+    """In the image and on the map; the others are those of a stream without empty samples."""
+    plain, emptied = stream(name, views, bank), stream(name, views, bank, empty_fraction=0.3)
+    pairs = [(plain.sample(i), emptied.sample(i)) for i in range(200)]
+    empty = [not (new["zero"].any() or new["target"].any()) and old["zero"].any() for old, new in pairs]
+    assert 0.2 < np.mean(empty) < 0.4
     unchanged = [name for name in pairs[0][0] if name not in ("zero", "target")]
-    for (old, new), is_blank in zip(pairs, blank):
-        assert all(np.array_equal(old[name], new[name]) for name in (unchanged if is_blank else old))
+    for (old, new), is_empty in zip(pairs, empty):
+        assert all(np.array_equal(old[name], new[name]) for name in (unchanged if is_empty else old))
 
 
 def test_modsem_shows_one_of_the_draws_at_random(views, bank):
@@ -217,7 +217,7 @@ def test_modsem_shows_one_of_the_draws_at_random(views, bank):
     assert shown.sum() == 400 and shown.min() > 25
 
 
-def test_modsem_is_white_on_instances_alone(views, bank):
+def test_modsem_is_white_on_instances_only(views, bank):
     data = stream("modsem", views, bank)
     samples = [data.sample(i) for i in range(5 * len(views))]
     for sample, view in zip(samples, views_of_samples(views, samples)):
@@ -229,11 +229,11 @@ def test_modsem_is_white_on_instances_alone(views, bank):
 def test_depth_proj_is_the_projection_of_its_rectangles(views, bank):
     batch = as_float(stream("depth", views, bank, batch=20).batch(0))
     assert torch.equal(batch["target"], inverse_project(batch["zero"], batch["depth"], CAMERA))
-    assert (batch["target"] <= batch["fov"]).all()  # nothing is known that was not seen
+    assert (batch["target"] <= batch["fov"]).all()  # no evidence outside of the field of view
     assert len({image.numpy().tobytes() for image in batch["zero"]}) == 20
 
 
-def test_semantic_tuples_are_the_samples_of_the_evaluation(views, bank):
+def test_semantic_samples_are_those_of_the_evaluation(views, bank):
     batch = as_float(stream("semantic", views, bank, batch=len(views)).batch(0))
     evaluated = next(semantic_batches(views, CAMERA, len(views)))
     order = [(evaluated["rgb"] == rgb).flatten(1).all(dim=1).nonzero().item() for rgb in batch["rgb"]]
@@ -242,7 +242,7 @@ def test_semantic_tuples_are_the_samples_of_the_evaluation(views, bank):
 
 
 def test_the_first_views_of_each_scene_are_the_same_views(views):
-    """Of shards with 5 and 3 views the first 4 are views 0-3 and 5-7, with the depth that was given to them."""
+    """The first 4 views of shards with 5 and 3 views are 0-3 and 5-7, with their replaced depth."""
     maps = [np.full((count, 24, 24), 1.0 + i, np.float32) for i, count in enumerate(COUNTS)]
     for some in (views.with_depth(maps).first(4), views.first(4).with_depth(maps)):
         assert len(some) == 7 and len(some.first(None)) == 7
@@ -265,14 +265,14 @@ def test_depth_may_be_replaced(views, bank, dtype):
     batch, given = (as_float(stream("depth", each, bank).batch(0)) for each in (predicted, views))
     assert torch.equal(batch["target"], inverse_project(batch["zero"], batch["depth"], CAMERA))
     assert torch.equal(batch["zero"], given["zero"]) and not torch.equal(batch["target"], given["target"])
-    with pytest.raises(InputError, match=r"depth maps: expected \[5, 3\] views a shard, found \[3, 5\]"):
+    with pytest.raises(InputError, match=r"depth maps: expected \[5, 3\] views per shard, found \[3, 5\]"):
         views.with_depth(maps[::-1])
     with pytest.raises(InputError, match=r"depth maps: expected views of \(24, 24\), found \(20, 24\)"):
         views.with_depth([map_[:, :20] for map_ in maps]).locate(0)
 
 
 def test_textures_are_independent_of_the_scene(folder, bank):
-    """P3: over many draws every class of the map, and every cell, is white as often as the texture is."""
+    """P3: over many draws all classes and all cells of the map have the texture's white fraction."""
     views = ViewSet([Shard(folder / "0.h5", CAMERA, TEXTURE)])
     draws = 400
     label = views.shards[0].instance_label
@@ -284,7 +284,7 @@ def test_textures_are_independent_of_the_scene(folder, bank):
         white[index_of[sample["depth"][0].tobytes()]].append(sample["target"][0])
     for i, maps in white.items():
         maps = np.array(maps)
-        assert len({m.tobytes() for m in maps}) > 0.95 * len(maps)  # the same view, always another texture
+        assert len({m.tobytes() for m in maps}) > 0.95 * len(maps)  # one view, another texture each time
         view = views.locate(i)[1]
         surface = view.bev_texel[..., 0] >= 0
         assert maps[:, surface].mean() == pytest.approx(0.2, abs=0.03)
@@ -297,7 +297,7 @@ def test_textures_are_independent_of_the_scene(folder, bank):
             assert abs(contrast.mean()) < 4 * contrast.std() / np.sqrt(len(contrast))
 
 
-def test_classes_are_disjoint_and_are_the_labels_of_what_is_seen(views):
+def test_classes_are_disjoint_and_agree_with_the_labels(views):
     batches = list(semantic_batches(views, CAMERA, 3))
     assert [len(batch["scene"]) for batch in batches] == [3, 3, 2]
     whole = {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
@@ -340,7 +340,7 @@ def test_auxiliary_maps_of_a_room(views):
         assert np.array_equal(obstacles > 0, np.isin(view.bev_instance, (7, 8, 9, 11)))
 
 
-def test_what_is_painted_from_above_wears_the_plan_all_along_the_vertical(views):
+def test_extruded_textures_are_constant_along_the_vertical(views):
     seen = 0
     for index in range(len(views)):
         shard, view = views.locate(index)
@@ -353,7 +353,7 @@ def test_what_is_painted_from_above_wears_the_plan_all_along_the_vertical(views)
         painted = fpv[..., 0] == chart
         assert np.array_equal(fpv[~painted], view.fpv_texel[~painted])
         assert not painted[(height > CAMERA.max_height_m) | (height < CAMERA.obstacle_m)].any()
-        # a raised pixel wears what its cell wears, up to the size of a cell, whatever its height
+        # a raised pixel has the texel of its cell, up to the size of a cell, at any height
         cell = cells_of_pixels(torch.from_numpy(view.depth), CAMERA).numpy()
         both = painted & (cell < 20**2)
         both[both] = raised.ravel()[cell[both]]
@@ -363,7 +363,7 @@ def test_what_is_painted_from_above_wears_the_plan_all_along_the_vertical(views)
     assert seen > 100
 
 
-def test_a_plan_belongs_to_the_world_and_not_to_the_camera(views):
+def test_extruded_textures_are_fixed_in_the_world(views):
     _, view = views.locate(0)
     x, y, z, yaw = view.pose
     turned = extruded_texels(replace(view, pose=np.array([x, y, z, yaw + np.pi / 2])), CAMERA, 9)[1]
@@ -373,18 +373,18 @@ def test_a_plan_belongs_to_the_world_and_not_to_the_camera(views):
     assert np.abs(moved[raised][:, 1:].astype(int) - bev[raised][:, 1:] - (300, -200)).max() <= 1
     first, last = np.argwhere(raised)[[0, -1]]
     along, after = (t[tuple(last)][1:].astype(int) - t[tuple(first)][1:] for t in (bev, turned))
-    assert np.abs(after - (-along[1], along[0])).max() <= 2  # a quarter turn of the camera turns the plan
+    assert np.abs(after - (-along[1], along[0])).max() <= 2  # a quarter turn of the camera rotates the texels
 
 
-def test_the_asked_share_of_samples_is_painted_from_above(views, bank):
-    plain, upright = (SynthSamples(views, bank, CAMERA, 1, 6, extruded_fraction=share) for share in (0.0, 0.4))
-    changed = [not np.array_equal(plain.sample(i)["zero"], upright.sample(i)["zero"]) for i in range(200)]
+def test_the_configured_fraction_of_samples_is_extruded(views, bank):
+    plain, extruded = (SynthSamples(views, bank, CAMERA, 1, 6, extruded_fraction=fraction) for fraction in (0.0, 0.4))
+    changed = [not np.array_equal(plain.sample(i)["zero"], extruded.sample(i)["zero"]) for i in range(200)]
     assert 0.3 < np.mean(changed) < 0.5
-    kept = SynthSamples(
+    fixed = SynthSamples(
         views, bank, CAMERA, 1, 6, fresh=False, extruded_fraction=0.5
-    )  # with one texture a scene, by scene
+    )  # with one texture per scene, per scene
     maps = {}
     for i in range(40):
-        view = views_of_samples(views, [kept.sample(i)])[0]
-        maps.setdefault(view.rgb.tobytes(), set()).add(kept.sample(i)["target"].tobytes())
+        view = views_of_samples(views, [fixed.sample(i)])[0]
+        maps.setdefault(view.rgb.tobytes(), set()).add(fixed.sample(i)["target"].tobytes())
     assert all(len(found) == 1 for found in maps.values())

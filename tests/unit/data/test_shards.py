@@ -1,4 +1,4 @@
-"""Shards: what is written is read, the same seed gives the same bytes, and nothing half-done is left behind."""
+"""Shards: round trip, same bytes for the same seed, and no partial files."""
 
 import pickle
 import time
@@ -71,7 +71,7 @@ def test_fields_have_the_documented_types(views):
     assert {name: (array.shape, array.dtype.name) for name, array in arrays.items()} == expected
 
 
-def test_a_view_is_what_the_sensors_see_at_its_pose(scene, views):
+def test_a_view_agrees_with_the_sensors_at_its_pose(scene, views):
     caster, photographer = RayCaster(scene), Photographer(scene, CAMERA)
     for view in views:
         pose = Pose(*view.pose)
@@ -90,8 +90,8 @@ def test_poses_that_see_too_little_are_refused(scene):
         views_of(build(room((1.3, 1.3, 2.5))))
 
 
-def test_a_glance_refuses_what_a_large_image_would(scene):
-    """Up to the rim of the image, which a glance sees half of its own, larger pixels narrower."""
+def test_a_preview_refuses_the_same_poses_as_a_large_image(scene):
+    """Up to the image's border: centres of a preview's larger pixels are farther inside."""
     camera = replace(CAMERA, fpv_px=200)
     source, caster, rng = (
         ViewSource(scene, camera, TEXTURE, np.random.default_rng(0)),
@@ -108,15 +108,15 @@ def test_a_glance_refuses_what_a_large_image_would(scene):
     assert taken[seen >= 0.12].all() and not taken[seen < 0.1].any()
 
 
-def test_a_shard_travels_to_another_process_while_open(scene, views, tmp_path):
+def test_an_open_shard_can_be_sent_to_another_process(scene, views, tmp_path):
     write_shard(tmp_path / "a.h5", scene, views, CAMERA, TEXTURE, SEED)
     shard = Shard(tmp_path / "a.h5", CAMERA, TEXTURE)
     first = shard.view(0)
     assert np.array_equal(pickle.loads(pickle.dumps(shard)).view(0).rgb, first.rgb)
 
 
-def test_what_was_read_is_not_kept(scene, views, tmp_path):
-    """HDF5 would keep some megabytes of chunks of every shard that is open: in the end, all views."""
+def test_views_are_not_cached(scene, views, tmp_path):
+    """HDF5's chunk cache takes megabytes per open shard."""
     write_shard(tmp_path / "a.h5", scene, views, CAMERA, TEXTURE, SEED)
     shard = Shard(tmp_path / "a.h5", CAMERA, TEXTURE)
     shard.view(0)
@@ -128,11 +128,11 @@ def test_same_seed_same_bytes_at_any_time(scene, views, tmp_path):
     write_shard(tmp_path / "a.h5", scene, views, CAMERA, TEXTURE, SEED)
     other = views_of(scene, seed=1)
     write_shard(tmp_path / "c.h5", scene, other, CAMERA, TEXTURE, SEED)
-    time.sleep(1.1)  # HDF5 keeps times in seconds, where it is let
+    time.sleep(1.1)  # HDF5 can store times, in seconds
     first = checksum(tmp_path / "a.h5")
     assert first != checksum(tmp_path / "c.h5")
     noise = np.random.default_rng(0)
-    for _ in range(20):  # whatever was compressed before, and whatever the memory holds
+    for _ in range(20):  # independent of earlier compression and of the memory's content
         noisy = [replace(view, depth=noise.random(view.depth.shape, np.float32)) for view in other]
         write_shard(tmp_path / "c.h5", scene, noisy, CAMERA, TEXTURE, SEED)
         write_shard(tmp_path / "b.h5", scene, views_of(scene), CAMERA, TEXTURE, SEED)
@@ -149,7 +149,7 @@ def test_a_view_that_fails_leaves_nothing(scene, views, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_that_are_no_shard_of_this_camera(scene, views, tmp_path):
+def test_files_that_are_not_shards_of_this_camera(scene, views, tmp_path):
     path = tmp_path / "a.h5"
     with pytest.raises(InputError, match=r"a\.h5: expected a shard of views, found .*"):
         Shard(path, CAMERA, TEXTURE)
@@ -160,7 +160,7 @@ def test_files_that_are_no_shard_of_this_camera(scene, views, tmp_path):
         Shard(path, CAMERA, replace(TEXTURE, modsem_fraction=0.2))
     assert (
         len(Shard(path, CAMERA, replace(TEXTURE, white_fraction=0.1))) == VIEWS
-    )  # views know nothing of *Synth* textures
+    )  # views do not depend on *Synth* textures
     whole = path.read_bytes()
     for length in (0, 100, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])

@@ -53,7 +53,7 @@ def test_floor_depth_of_an_empty_room_by_row():
 
 @pytest.mark.parametrize("pose", POSES)
 def test_depth_and_instance_of_an_empty_room(pose):
-    """The first of the six planes that a ray leaves through."""
+    """By the first of the six planes on each ray."""
     seen = RayCaster(build(room(SIZE))).fpv(pose, CAMERA)
     directions = fpv_rays(CAMERA) @ pose.world_R_camera.T
     centre = pose.centre(CAMERA)
@@ -69,7 +69,7 @@ def test_depth_and_instance_of_an_empty_room(pose):
 
 
 def expected_map(pose: Pose, camera: CameraConfig, things: dict[int, tuple]) -> tuple[np.ndarray, ...]:
-    """Instance and height of every cell of a furnished room, and which cells lie clear of all borders."""
+    """Instance and height of every cell of a furnished room, and the cells away from all borders."""
     x, y, _ = np.moveaxis(world_cells(pose, camera, np.zeros((camera.bev_px,) * 2)), -1, 0)
     instance, height = np.zeros(x.shape, int), np.zeros(x.shape)
     clear = np.ones(x.shape, bool)
@@ -104,8 +104,8 @@ def test_height_is_above_the_floor_of_the_pose():
     assert seen.distance[seen.instance == FLOOR] == pytest.approx(0, abs=1e-5)
 
 
-def test_culled_faces_are_passed_one_after_the_other():
-    """From outside, through two rooms' backs: a wall is seen only where it faces the camera."""
+def test_rays_pass_through_several_culled_faces():
+    """From outside, through the backs of two rooms: a wall is visible only if it faces the camera."""
     scene = build([*room((2, 2, 2.5)), box("chest", (0.5, 0.5, 0), (1.5, 1.5, 1))])
     seen = RayCaster(scene).fpv(Pose(-1, 1, 0, 0), CAMERA)
     assert seen.instance[26, 24] == 7 and seen.distance[26, 24] == pytest.approx(1.5, abs=1e-4)
@@ -131,7 +131,7 @@ def texel_distance(scene: Scene, texel: np.ndarray, instance: np.ndarray, points
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_texel_is_the_point_that_is_seen(pose):
+def test_texel_is_at_the_visible_point(pose):
     scene = build(furnished())
     caster = RayCaster(scene)
     fpv, bev = caster.fpv(pose, CAMERA), caster.bev(pose, CAMERA)
@@ -150,7 +150,7 @@ def test_texel_is_the_point_that_is_seen(pose):
 
 @pytest.mark.parametrize("pose", POSES)
 def test_atlas_index_is_the_texel(pose):
-    """Charts laid end to end, and one more place for nothing."""
+    """Concatenated charts, and one more entry for no hit."""
     scene = build(furnished())
     laid_out = [
         np.stack([np.full(image.shape, chart), *np.indices(image.shape)], axis=-1).reshape(-1, 3)
@@ -181,7 +181,7 @@ def home(request) -> tuple[Scene, list[Pose]]:
 
 
 def test_pair_is_aligned(home):
-    """P1 and P2: a visible cell and the pixel that sees it show the same point of the surface."""
+    """P1 and P2: a visible cell and its pixel show the same point of the surface."""
     scene, poses = home
     camera = CameraConfig(fpv_px=512, bev_px=50)
     caster = RayCaster(scene)
@@ -196,7 +196,7 @@ def test_pair_is_aligned(home):
         column, row = (np.floor(axis / z * camera.focal_px + camera.fpv_px / 2).astype(int) for axis in (x, y))
         shown = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < camera.fpv_px) & (bev.texel[..., 0] >= 0)
         row, column = row[shown], column[shown]
-        # pixels that see the cell's point itself, at a distance of no more than 5 cm
+        # pixels of the cell's point, at a distance of at most 5 cm
         centres = map_points(torch.from_numpy(fpv.distance), camera).numpy()[row, column]
         right, forward = bev_cell_centres(camera)
         cells = np.stack([right, forward, bev.distance], axis=-1)[shown]
@@ -222,17 +222,17 @@ def look_up(textures: list[np.ndarray], texels: np.ndarray) -> np.ndarray:
 
 
 def interior(depth: np.ndarray) -> np.ndarray:
-    """Pixels whose 3 x 3 neighbourhood is one surface: depth varies by less than 4 % in it."""
+    """Pixels with one surface in their 3 x 3 neighbourhood: depth varies by less than 4 %."""
     lowest, highest = (f(depth, size=3, mode="nearest") for f in (ndimage.minimum_filter, ndimage.maximum_filter))
     return (lowest > 0) & (highest < 1.04 * lowest)
 
 
 def test_ray_caster_and_rasteriser_agree_on_depth(home):
-    """The rasteriser gives the depth of one of a pixel's samples, up to half a pixel from its centre."""
+    """The rasteriser returns the depth of one of a pixel's samples, up to half a pixel from its centre."""
     scene, poses = home
     camera = replace(CAMERA, fpv_px=96)
     photographer, caster = Photographer(scene, camera), RayCaster(scene)
-    twice = replace(camera, fpv_px=2 * camera.fpv_px)  # the rasteriser's own, super-sampled pixels
+    twice = replace(camera, fpv_px=2 * camera.fpv_px)  # the rasteriser's super-sampled pixels
     agree, of = 0, 0
     for pose in poses:
         rasterised, cast = photographer.depth(pose), caster.fpv(pose, twice).distance
@@ -244,8 +244,8 @@ def test_ray_caster_and_rasteriser_agree_on_depth(home):
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_photograph_shows_what_the_ray_caster_sees(pose):
-    """A pixel of the photograph is the mean of the colours that rays through it meet, also at borders."""
+def test_photograph_agrees_with_the_ray_caster(pose):
+    """A pixel of the photograph is the mean of the colours on the rays through it, also at borders."""
     scene, fine = build(furnished()), 8
     photo = Photographer(scene, CAMERA).take(pose).astype(float)
     seen = RayCaster(scene).fpv(pose, replace(CAMERA, fpv_px=fine * CAMERA.fpv_px))
@@ -259,13 +259,13 @@ def test_photograph_shows_what_the_ray_caster_sees(pose):
     plain = ndimage.generic_filter(seen.instance[::fine, ::fine], np.ptp, 3) == 0
     assert plain.mean() > 0.7
     assert (difference(0, 0)[plain] < 1).mean() >= 0.995
-    # a quarter of a pixel to any side is worse already
+    # a shift of a quarter of a pixel to any side is worse
     for move in ((2, 0), (-2, 0), (0, 2), (0, -2)):
         assert difference(*move).mean() > 1.2 * difference(0, 0).mean()
 
 
 def picture(left: float, rows: int, columns: int, colors: list[tuple], repeats: int = 1) -> trimesh.Trimesh:
-    """A square of 0.8 m, 2 m before `EASEL`, from `left` metres on; an image of four quadrants, so many times."""
+    """A square of 0.8 m, 2 m in front of `EASEL`, from `left` metres on; a repeated image of four quadrants."""
     corners = [(2, -left - across, 0.48 + up) for across, up in ((0, 0), (0.8, 0), (0.8, 0.8), (0, 0.8))]
     image = np.zeros((rows, columns, 3), np.uint8)
     for quadrant, color in zip(np.ndindex(2, 2), colors):
@@ -279,8 +279,8 @@ EASEL = Pose(0, 0, 0, 0)
 
 
 @pytest.mark.parametrize("atlas_px", [8192, 24, 8])
-def test_each_texture_is_where_it_belongs(atlas_px, monkeypatch):
-    """Images of any width, in one atlas or several, once or repeated, keep their colours and places."""
+def test_each_texture_is_on_its_surface(atlas_px, monkeypatch):
+    """Images of any width, in one atlas or several, once or repeated, keep their colours and positions."""
     monkeypatch.setattr(surfaces, "_ATLAS_PX", atlas_px)
     rng = np.random.default_rng(0)
     colors = rng.integers(0, 256, (4, 4, 3))
@@ -297,7 +297,7 @@ def test_each_texture_is_where_it_belongs(atlas_px, monkeypatch):
             )
             shown, expected = photo[int(row), int(column)], quadrants[2 * (down % 2) + right % 2]
             assert np.abs(shown - expected).max() <= 1
-    # nothing of a neighbour at the rims: an upper quadrant each
+    # no colour of a neighbour at the borders of the upper quadrants
     for (left, _, _, _), quadrants in zip(places, colors):
         row = int(camera.focal_px * (camera.height_m - 1.28 + 0.1) / 2 + camera.fpv_px / 2)
         for x, column_of in ((0.02, 0), (0.78, 1)):
@@ -316,7 +316,7 @@ def test_photographers_of_two_scenes_and_sizes_take_turns():
 
 
 def test_photographs_need_no_window_and_no_python_before_3_12():
-    """What pyrender and the PyOpenGL that it pins would do by themselves fails on a bare Debian and on Python 3.12."""
+    """Unpatched, pyrender and its pinned PyOpenGL fail on a minimal Debian and on Python 3.12."""
     assert surfaces.pyrender.viewer.pyglet.options.headless
     renamed = type("CArgObject", (), {"__module__": "_ctypes"})  # as Python 3.12 calls what `ctypes.byref` gives
     assert FormatHandler.match(renamed) is not None

@@ -16,7 +16,7 @@ from support.scenes import Thing, box, build, furnished, room
 CAMERA = CameraConfig(fpv_px=32, bev_px=50)
 POSES = (Pose(2.0, 0.5, 0, 1.0), Pose(4.4, 2.4, 0, -2.9))
 OPEN = [thing for thing in furnished() if thing.name != "ceiling"]
-FLAT = np.array([[(0, 0, 0), (5, 0, 0), (5, 4, 0), (0, 4, 0)]], float)  # looks up
+FLAT = np.array([[(0, 0, 0), (5, 0, 0), (5, 4, 0), (0, 4, 0)]], float)  # faces up
 SLOPE = np.array([(0, 0, 2.05), (0, 0, 2.05), (0, 0, 4), (0, 0, 4)])
 SHEETS = {"flat": np.add(FLAT, (0, 0, 2.45)), "sloped": np.add(FLAT, SLOPE)}
 
@@ -55,7 +55,7 @@ def test_each_of_two_storeys_has_its_own_map(apart_m, slab_m, double_sided):
         lower, upper = both.bev(pose, CAMERA), both.bev(replace(pose, floor_z=apart_m), CAMERA)
         expected = alone.bev(pose, CAMERA)
         assert same(lower, expected)
-        on_floor = expected.instance > 0  # below the upper storey's edges is the lower one
+        on_floor = expected.instance > 0  # the lower storey is visible beyond the upper one's edges
         assert [names[i - 1] for i in upper.instance[on_floor]] == [names[i - 1] for i in expected.instance[on_floor]]
         assert upper.distance[on_floor] == pytest.approx(expected.distance[on_floor], abs=1e-5)
 
@@ -76,7 +76,7 @@ AROUND = (2.2, 2.4), (2.6, 2.8)
 @pytest.mark.parametrize(
     ("low", "high", "instance", "height"),
     [
-        (1.5, 1.8, NEW, 1.8),  # a lamp, a beam or a shelf that a head would meet
+        (1.5, 1.8, NEW, 1.8),  # a lamp, a beam or a shelf at head height
         (1.9, 2.3, NEW, 2.3),  # it reaches below 2 m
         (0.0, 2.3, NEW, 2.3),  # a wardrobe
         (0.0, 2.0, NEW, 2.0),
@@ -91,12 +91,12 @@ def test_two_metres_decide(low, high, instance, height, double_sided):
     found = seen(closed, double_sided=double_sided)
     assert cell(found, POSES[0], *HERE) == (instance, pytest.approx(height, abs=1e-5))
     open_below = Thing("thing", np.delete(closed.quads, 1, axis=0))
-    if low == 0:  # as it is scanned, without what cannot be seen
+    if low == 0:  # as in a scan, without invisible faces
         assert same(seen(open_below, double_sided=double_sided), found)
 
 
 def test_a_wall_is_wall_and_a_door_in_it_is_open():
-    """A lintel over 2 m is above the map, as it is for inverse projection; the wall beside it is cut."""
+    """A lintel above 2 m is not on the map, as in inverse projection; the wall beside it is cut."""
     parts = [((2.0, 2.5, 0), (2.3, 2.7, 2.5)), ((2.3, 2.5, 2.1), (2.9, 2.7, 2.5)), ((2.9, 2.5, 0), (3.2, 2.7, 2.5))]
     wall = Thing("wall", np.concatenate([box("wall", *part).quads for part in parts]))
     for double_sided in (False, True):
@@ -106,7 +106,7 @@ def test_a_wall_is_wall_and_a_door_in_it_is_open():
 
 
 def test_sidedness_is_of_each_face():
-    """From outside, the near wall's back: it is seen where it is double-sided, while all others stay as they are."""
+    """From outside, the back of the near wall is visible if it is double-sided; all else is unchanged."""
     scene = build([*room((2, 2, 2.5)), box("chest", (0.5, 0.5, 0), (1.5, 1.5, 1))])
     pose, camera = Pose(-1, 1, 0, 0), CameraConfig(fpv_px=48, bev_px=50)
     for owner, instances, depths in ((5, (5, 5), (1, 1)), (6, (7, 6), (1.5, 3))):
@@ -120,8 +120,8 @@ def map_of(scene: Scene, pose: Pose) -> GBuffer:
     return RayCaster(scene).bev(pose, CAMERA)
 
 
-def test_generated_homes_differ_in_what_hangs_from_their_ceilings_alone():
-    """Recorded data has their lamps on the map; by any other name the home has none above 2 m."""
+def test_generated_homes_differ_only_in_their_lamps():
+    """Recorded data have their lamps on the map; under another name the home has none above 2 m."""
     home = generate_home("Home0000003", np.random.default_rng(3))
     other = replace(home, name="other")
     assert home.generated and not other.generated

@@ -26,8 +26,8 @@ run_command(main)
     ("environment", "remedy"),
     [
         ({"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent"}, "install libegl1 libgl1 libgl1-mesa-dri"),
-        ({"EGL_DEVICE_ID": "99"}, "set EGL_DEVICE_ID to a device that is there"),
-        ({"EGL_DEVICE_ID": "first"}, "set EGL_DEVICE_ID to a device that is there"),
+        ({"EGL_DEVICE_ID": "99"}, "set EGL_DEVICE_ID to an existing device"),
+        ({"EGL_DEVICE_ID": "first"}, "set EGL_DEVICE_ID to an existing device"),
         ({"PYOPENGL_PLATFORM": "osmesa"}, "install libosmesa6 .* or set PYOPENGL_PLATFORM=egl"),
         ({"PYOPENGL_PLATFORM": "window"}, "expected egl or osmesa, .* found 'window'"),
     ],

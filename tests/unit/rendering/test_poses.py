@@ -1,4 +1,4 @@
-"""Navigable floor of hand-made rooms, of which the free area is known."""
+"""Navigable floor of hand-made rooms with known free area."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -26,7 +26,7 @@ def is_free(floor: NavigableFloor, *point: float) -> bool:
     return bool((np.abs(floor.cells[:, :2] - point) <= AGENT.grid_m).all(axis=1).any())
 
 
-@pytest.mark.parametrize("size", [SIZE, (3.3, 3.3, 2.5)])  # in a square, cell centres lie on the faces' diagonal
+@pytest.mark.parametrize("size", [SIZE, (3.3, 3.3, 2.5)])  # in a square, cell centres are on the faces' diagonal
 def test_area_of_an_empty_room(size):
     floor = floor_of(*room(size))
     width, depth, _ = size
@@ -52,7 +52,7 @@ def test_area_of_an_empty_room(size):
 def test_what_blocks(thing, blocks):
     empty, floor = floor_of(*room(SIZE)), floor_of(*room(SIZE), thing)
     assert is_free(floor, 2.0, 1.5) is not blocks
-    # the body stays its radius away: a square of 1 m grows by it on all sides, with round corners
+    # obstacles grow by the body's radius on all sides, with round corners
     side, r = 1.0, AGENT.radius_m
     taken = side**2 + 4 * side * r + np.pi * r**2 if blocks else 0
     assert empty.area_m2 - floor.area_m2 == pytest.approx(taken, abs=4 * (side + 2 * r) * AGENT.grid_m)
@@ -61,7 +61,7 @@ def test_what_blocks(thing, blocks):
         assert np.linalg.norm(near, axis=1).min() >= r - AGENT.grid_m
 
 
-def test_the_floor_inside_a_cupboard_is_no_place_to_stand():
+def test_the_floor_inside_a_cupboard_is_not_navigable():
     cupboard = box("cupboard", (1.0, 1.0, 0), (2.0, 2.0, 2.2))
     hollow = Thing("cupboard", cupboard.quads[[0, 2, 3, 4, 5]])  # no bottom: the room's floor is inside
     assert not is_free(floor_of(*room(SIZE), hollow), 1.5, 1.5)
@@ -83,13 +83,13 @@ def test_two_storeys_are_found():
         assert storey.sum() * AGENT.grid_m**2 == pytest.approx(free, abs=2 * (width + depth) * AGENT.grid_m)
 
 
-def test_nobody_stands_on_the_edge_of_a_gallery():
+def test_the_edge_of_a_gallery_is_not_navigable():
     floor = floor_of(*room((6, 4, 5.2)), box("floor", (3, 0, 2.6), (6, 4, 2.7)))
     gallery = floor.cells[floor.cells[:, 2] > 1]
     assert gallery[:, 0].min() >= 3 + AGENT.radius_m - AGENT.grid_m / 2
     assert is_free(floor, 2.5, 2) and is_free(floor, 4.5, 2)
     below = floor.cells[np.abs(floor.cells[:, 2]) < 0.01]
-    # below it the floor goes on, without a seam at its edge
+    # the floor below is continuous
     under = NavigableFloor(below, AGENT.grid_m)
     assert all(is_free(under, x, 2) for x in (2.9, 3, 3.1, 4.5))
 
@@ -102,8 +102,8 @@ def test_an_unused_vertex_far_away_changes_nothing():
 
 
 @pytest.mark.parametrize("apart_m", [2.5, 2.75, 3.2])
-def test_stairs_that_are_called_floor_join_no_storeys(apart_m):
-    """Steps of a floor's name lead from one storey to the other; each storey keeps its own free floor."""
+def test_stairs_of_class_floor_do_not_join_storeys(apart_m):
+    """Steps with a floor's name lead from one storey to the other; each storey has its free floor."""
     upper = box("floor", (0, 0, apart_m - 0.2), (4, 3, apart_m))
     count = int(np.ceil(apart_m / 0.18))
     rise = apart_m / count
@@ -124,7 +124,7 @@ def test_poses_are_uniform():
     poses = [floor.draw(rng) for _ in range(20_000)]
     points = np.array([(pose.x, pose.y) for pose in poses])
     cells = {tuple(cell): i for i, cell in enumerate(np.floor(floor.cells[:, :2] / floor.grid_m + 1e-6).astype(int))}
-    hit = [cells[tuple(cell)] for cell in np.floor(points / floor.grid_m).astype(int)]  # each lies in a free cell
+    hit = [cells[tuple(cell)] for cell in np.floor(points / floor.grid_m).astype(int)]  # each is in a free cell
     assert chisquare(np.bincount(hit, minlength=len(cells))).pvalue > 0.01
     for axis in (0, 1):
         assert kstest(points[:, axis] / floor.grid_m % 1, "uniform").pvalue > 0.01
@@ -139,7 +139,7 @@ def test_floor_is_a_function_of_scene_and_seed():
     assert all(a == b for a, b in pairwise(draws))
 
 
-def test_scenes_without_a_place_to_stand():
+def test_scenes_without_navigable_floor():
     with pytest.raises(InputError, match=r"scene test: .*class floor, found none"):
         floor_of(box("bed", (0, 0, 0), (2, 2, 0.5)))
     with pytest.raises(InputError, match=r"scene test: .*free floor, found none"):

@@ -23,7 +23,7 @@ WALL = (200, 30, 40)
 
 
 def pane(distance: float, half: float = 4.0) -> np.ndarray:
-    """(4, 3) corners of a square before `EYE`, counter-clockwise from its lower left."""
+    """(4, 3) corners of a square in front of `EYE`, counter-clockwise from its lower left."""
     height = CAMERA.height_m
     sides = [(1, -1), (-1, -1), (-1, 1), (1, 1)]
     return np.array([(distance, half * left, height + half * up) for left, up in sides])
@@ -34,7 +34,7 @@ def plain(color: tuple[int, ...]) -> bytes:
 
 
 def photo(glb: GlbFile, path: Path, lit: bool = False) -> np.ndarray:
-    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(path / "a.glb"))[1], unlit=not lit)
+    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(path / "a.glb")), unlit=not lit)
     return Photographer(scene, CAMERA).take(EYE).astype(int)
 
 
@@ -90,7 +90,7 @@ def test_untextured_vertex_colors_without_a_material(tmp_path: Path) -> None:
     [(0, None, False), (127, None, False), (129, None, True), (200, 0.8, False), (210, 0.8, True), (0, 0.0, True)],
 )
 def test_masks_are_open_or_closed(tmp_path: Path, alpha: int, cutoff: float | None, seen: bool, lit: bool) -> None:
-    """A masked pane hides the wall behind it where alpha reaches the cutoff, and else is not there."""
+    """A masked pane hides the wall behind it if alpha reaches the cutoff, else it is invisible."""
     glb = before_a_wall()
     more = {} if cutoff is None else {"alphaCutoff": cutoff}
     glb.place(glb.quad(pane(3), UV, glb.material(plain((20, 60, 220, alpha)), alphaMode="MASK", **more)))
@@ -100,7 +100,7 @@ def test_masks_are_open_or_closed(tmp_path: Path, alpha: int, cutoff: float | No
         np.testing.assert_allclose(found, (20, 60, 220) if seen else WALL, atol=1)
 
 
-def test_opaque_materials_have_no_use_for_alpha(tmp_path: Path) -> None:
+def test_opaque_materials_ignore_alpha(tmp_path: Path) -> None:
     glb = before_a_wall()
     material = glb.material(plain((20, 60, 220, 0)), factor=[1, 1, 1, 0])
     glb.place(glb.quad(pane(3), UV, material, COLOR_0=glb.array(np.tile([1, 1, 1, 0], (4, 1)))))
@@ -109,8 +109,8 @@ def test_opaque_materials_have_no_use_for_alpha(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("merged", [False, True])
 @pytest.mark.parametrize("order", [(2, 3), (3, 2)])
-def test_glass_lets_the_room_be_seen(tmp_path: Path, order: tuple[int, int], merged: bool) -> None:
-    """Two panes, in either order and of one primitive or two: the farther one shows through the nearer one."""
+def test_the_room_is_visible_through_glass(tmp_path: Path, order: tuple[int, int], merged: bool) -> None:
+    """Two panes, in either order and of one primitive or two: the farther is visible through the nearer."""
     alpha = {2: 0.25, 3: 0.5}
     colors = {2: np.array([0, 255, 0]), 3: np.array([0, 0, 255])}
     glb = before_a_wall()
@@ -133,7 +133,7 @@ def test_glass_lets_the_room_be_seen(tmp_path: Path, order: tuple[int, int], mer
 
 @pytest.mark.parametrize("mode", [CLAMP, REPEAT, MIRROR])
 def test_wrap_modes_and_texture_transforms(tmp_path: Path, mode: int) -> None:
-    """A texture that leaves its image looks like the image with the wrapping baked in."""
+    """A texture with coordinates beyond its image looks like an image with baked wrapping."""
     image = np.random.default_rng(0).integers(0, 256, (2, 4, 3), np.uint8).repeat(16, axis=0).repeat(16, axis=1)
     baked = np.pad(image, ((32, 32), (64, 64), (0, 0)), mode={CLAMP: "edge", REPEAT: "wrap", MIRROR: "symmetric"}[mode])
     seen = {}
@@ -146,23 +146,23 @@ def test_wrap_modes_and_texture_transforms(tmp_path: Path, mode: int) -> None:
             material = glb.material(encoded(baked))
         glb.place(glb.quad(pane(3, 1.5), UV, material))
         seen[name] = photo(glb, tmp_path)
-    difference = np.abs(seen["wrapped"] - seen["baked"])  # texture units round the places of look-ups, at borders
+    difference = np.abs(seen["wrapped"] - seen["baked"])  # texture units round coordinates at borders
     assert difference.mean() < 0.1
     assert difference.max() <= 10
     assert seen["baked"].std() > 20
 
 
 def test_materials_survive_writing(tmp_path: Path) -> None:
-    """A home that is read and written again looks the same."""
+    """A scene that is read and written again looks the same."""
     glb = before_a_wall()
     tint = glb.array(np.tile([0.8, 0.9, 1], (4, 1)))
     glass = glb.material(plain((250, 250, 250, 90)), alphaMode="BLEND", factor=[0.5, 1, 1, 0.9])
     glb.place(glb.quad(pane(3), UV, glass, COLOR_0=tint))
     mask = glb.material(plain((20, 60, 220, 100)), alphaMode="MASK", alphaCutoff=0.2)
     glb.place(glb.quad(pane(4, 1.0), UV, mask))
-    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(tmp_path / "a.glb"))[1])
+    scene = replace(build(room((1, 1, 1))), photograph=read_glb(glb.save(tmp_path / "a.glb")))
     write_scene(tmp_path / "00001-Test", scene)
-    back = replace(scene, photograph=read_glb(tmp_path / "00001-Test/Test.glb")[1])
+    back = replace(scene, photograph=read_glb(tmp_path / "00001-Test/Test.glb"))
     before, after = (Photographer(one, CAMERA).take(EYE).astype(int) for one in (scene, back))
     assert np.abs(before - after).max() <= 4
     assert before.std() > 10

@@ -1,4 +1,4 @@
-"""Names of HM3DSem to classes: pinned names, and all of habitat-sim's table where it is at hand."""
+"""Names of HM3DSem to classes: pinned names, and all of habitat-sim's table if it is available."""
 
 import pytest
 from hypothesis import given
@@ -86,12 +86,12 @@ def test_ceilings(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ceiling lamp", "lamp ceiling", "ceiling fan", "roof window", "floor", ""])
-def test_other_names_are_no_ceilings(name: str) -> None:
+def test_other_names_are_not_ceilings(name: str) -> None:
     assert not is_ceiling(name)
 
 
 @pytest.mark.skipif(not TABLE.exists(), reason=f"needs habitat-sim's table of names, {TABLE.name}")
-def test_every_spelling_of_ceiling_in_the_table_is_one() -> None:
+def test_every_spelling_of_ceiling_in_the_table_is_recognised() -> None:
     rows = [line.split("\t") for line in TABLE.read_text().splitlines()[1:]]
     assert all(is_ceiling(raw) for raw, category, _ in rows if category in ("ceiling", "roof", "ceiling panel"))
     assert not any(is_ceiling(raw) for raw, _, mpcat40 in rows if mpcat40 in ("lighting", "floor", "wall", "door"))

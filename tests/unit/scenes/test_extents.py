@@ -1,4 +1,4 @@
-"""Units and axes of homes: a home in metres is read, every other is refused with the likely cause."""
+"""Units and axes of scenes: one in metres is read, others are refused with the likely cause."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +26,7 @@ def turned(scene: Scene, matrix: np.ndarray) -> Scene:
 @pytest.mark.parametrize("scene", [HOME, BARE, build(room((0.4, 0.4, 2.5))), build(room((90, 70, 12)))])
 def test_homes_in_metres(scene):
     check_extents(scene, *FILES)
-    check_extents(replace(scene, vertices=scene.vertices + np.float32(1000)), *FILES)  # wherever they stand
+    check_extents(replace(scene, vertices=scene.vertices + np.float32(1000)), *FILES)  # at any position
 
 
 @pytest.mark.parametrize(("unit", "per_metre"), [("millimetres", 1000), ("centimetres", 100), ("inches", 39.37)])

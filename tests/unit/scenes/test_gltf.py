@@ -1,4 +1,4 @@
-"""What the glTF specification says of numbers, textures and nodes, against closed forms."""
+"""glTF's numbers, textures and nodes against closed forms of the specification."""
 
 import base64
 import io
@@ -32,11 +32,11 @@ def grid() -> bytes:
 
 
 def read(glb: GlbFile, folder: Path) -> list:
-    return list(read_glb(glb.save(folder / "a.glb"))[1].geometry.values())
+    return list(read_glb(glb.save(folder / "a.glb")).geometry.values())
 
 
 def scene_of(glb: GlbFile, root: Path, rows: str = ROWS) -> Any:
-    """A scene whose annotation and photograph are `glb`."""
+    """A scene with `glb` as annotation and photograph."""
     folder = root / "00001-Test"
     folder.mkdir(exist_ok=True)
     for name in ("Test.semantic.glb", "Test.glb"):
@@ -63,7 +63,7 @@ def simple(uv: Any = UV, sampler: dict | None = None, image: bytes | None = None
     ],
 )
 def test_integers(tmp_path: Path, kind: str, normalized: bool, value: Any) -> None:
-    """Integers as UV coordinates, as positions and as colours; the last are normalized in any case."""
+    """Integers as UV coordinates, positions and colours; the last are always normalized."""
     ends = np.iinfo(kind)
     stored = np.random.default_rng(0).integers(ends.min, ends.max, (4, 3), endpoint=True)
     stored[0] = ends.min, ends.max, 0
@@ -99,7 +99,7 @@ def test_sparse_accessors(tmp_path: Path, view: bool) -> None:
 
 
 def test_interleaved_vertices(tmp_path: Path) -> None:
-    """Positions and UV coordinates that alternate in one buffer view."""
+    """Alternating positions and UV coordinates in one buffer view."""
     glb = simple()
     rows = np.concatenate([SQUARE, UV[::-1]], axis=1).astype("<f4")
     view = glb.view(rows.tobytes(), byteStride=20)
@@ -112,7 +112,7 @@ def test_interleaved_vertices(tmp_path: Path) -> None:
 
 
 def rolled(faces: Any) -> set:
-    """Triangles with their smallest corner first: the same triangle has many spellings."""
+    """Triangles with their smallest corner first, for comparison."""
     return {tuple(np.roll(face, -int(np.argmin(face))).tolist()) for face in np.asarray(faces)}
 
 
@@ -128,7 +128,7 @@ def rolled(faces: Any) -> set:
     ],
 )
 def test_strips_and_fans(tmp_path: Path, mode: int, indices: list | None, faces: list) -> None:
-    """Winding alternates in a strip; points and lines beside it are passed over."""
+    """Winding alternates in a strip; points and lines are ignored."""
     glb = simple()
     primitive = glb.header["meshes"][0]["primitives"][0]
     primitive["mode"] = mode
@@ -142,7 +142,7 @@ def test_strips_and_fans(tmp_path: Path, mode: int, indices: list | None, faces:
 
 
 def test_nodes(tmp_path: Path) -> None:
-    """Matrix and TRS nest; a mirrored node keeps its front; the default scene alone is shown."""
+    """Matrix and TRS nest; a mirrored node keeps its front; only the default scene is read."""
     glb = simple()
     glb.header["nodes"][0] |= {"translation": [1, 2, 3], "rotation": [0, 0, 0.5**0.5, 0.5**0.5], "scale": [2, -1, 1]}
     matrix = np.array([[0, 0, 1, 5], [1, 0, 0, 6], [0, 1, 0, 7], [0, 0, 0, 1.0]])
@@ -151,7 +151,7 @@ def test_nodes(tmp_path: Path) -> None:
     glb.header |= {"scenes": [{"nodes": [other]}, {"nodes": [parent]}], "scene": 1}
     (mesh,) = read(glb, tmp_path)
     x, y, z = SQUARE.T
-    local = np.stack([y + 1, 2 * x + 2, z + 3], axis=1)  # (2 x, -y) turned by a quarter: (y, 2 x)
+    local = np.stack([y + 1, 2 * x + 2, z + 3], axis=1)  # (2 x, -y) rotated by a quarter turn: (y, 2 x)
     np.testing.assert_allclose(mesh.vertices, local @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-6)
     assert rolled(mesh.faces) == rolled([(2, 1, 0), (3, 2, 0)])
     glb.header["nodes"][parent]["children"] = [0, 0]
@@ -177,7 +177,7 @@ def test_instances(tmp_path: Path, required: bool) -> None:
 
 
 def test_texture_transforms(tmp_path: Path) -> None:
-    """Scale, then rotation (u towards -v), then offset; the set of coordinates is the transform's own."""
+    """Scale, then rotation (u towards -v), then offset; the transform chooses the set of coordinates."""
     transform = {"offset": [0.3, -0.2], "rotation": 0.7, "scale": [2.0, 0.5], "texCoord": 1}
     glb = simple(info={"texCoord": 7, "extensions": {"KHR_texture_transform": transform}})
     other = np.random.default_rng(0).random((4, 2))
@@ -194,7 +194,7 @@ def test_texture_transforms(tmp_path: Path) -> None:
 
 
 def wrapped(texel: np.ndarray, size: int, mode: int) -> np.ndarray:
-    """The texel of an image that a texel beyond its border stands for."""
+    """The texel of an image for a texel index beyond its border."""
     if mode == CLAMP:
         return np.clip(texel, 0, size - 1)
     if mode == REPEAT:
@@ -210,7 +210,7 @@ def wrapped(texel: np.ndarray, size: int, mode: int) -> np.ndarray:
     st.tuples(st.floats(-3, 3, width=16), st.floats(-3, 3, width=16)),
 )
 def test_wrap_modes(tmp_path: Path, across: int, down: int, corner: tuple, size: tuple) -> None:
-    """Each point of a face has the instance of the texel that its sampler gives, nearest."""
+    """Each point of a face has the instance of its sampler's nearest texel."""
     uv = np.array(corner) + UV * size
     scene = scene_of(simple(uv, {"wrapS": across, "wrapT": down}), tmp_path)
     weight = np.random.default_rng(0).dirichlet(np.ones(3), 500)
@@ -230,8 +230,8 @@ def test_a_file_without_sampler_repeats(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scene.chart_instance[0], IDS)
 
 
-def test_repetitions_without_end_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"at most 32767 texels a side, found 8 repeated 5000 times"):
+def test_too_many_repetitions_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"at most 32767 texels per side, found 8 repeated 5000 times"):
         scene_of(simple(UV * 5000), tmp_path)
     plain = encoded(np.full((6, 8, 3), COLORS[0]))
     scene = scene_of(simple(UV * 5000, image=plain), tmp_path)
@@ -283,7 +283,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("expected", REFUSED)
-def test_what_is_refused(tmp_path: Path, expected: str) -> None:
+def test_refused_files(tmp_path: Path, expected: str) -> None:
     glb = simple(sampler={})
     primitive = glb.header["meshes"][0]["primitives"][0]
     order = [primitive["attributes"]["POSITION"], primitive["indices"], primitive["attributes"]["TEXCOORD_0"]]
@@ -295,7 +295,7 @@ def test_what_is_refused(tmp_path: Path, expected: str) -> None:
 
 
 def test_lossy_annotations_are_refused(tmp_path: Path) -> None:
-    """Colours of no row are unknown; on more than a few per cent of the surface the texture cannot be right."""
+    """Colours of no row are unknown; on more than 5 % of the surface they are an error."""
     large = COLORS[IDS - 1].repeat(16, axis=0).repeat(16, axis=1)
     few, many = large.copy(), large.copy()
     rng = np.random.default_rng(0)
@@ -313,7 +313,7 @@ def test_lossy_annotations_are_refused(tmp_path: Path) -> None:
     assert not scene_of(simple(image=black), tmp_path).face_instance.any()
 
 
-def test_images_of_every_kind(tmp_path: Path) -> None:
+def test_images_of_every_mode(tmp_path: Path) -> None:
     """Grey of 16 bits is rounded to 8, not clipped; palettes and alpha keep their colours."""
     deep = np.array([[0, 20 * 257, 128 * 257 + 100, 65535]], np.uint16)
     with Image.open(io.BytesIO(encoded(deep))) as image:

@@ -1,4 +1,4 @@
-"""HM3DSem's format: a scene comes back as it was written, real homes are read right, and broken files say so."""
+"""HM3DSem's format: round trips, real scenes, and the errors for broken files."""
 
 import dataclasses
 import json
@@ -40,7 +40,7 @@ def quads(*corners: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.nd
 
 @pytest.fixture
 def scene() -> Scene:
-    """A floor and a chair's seat on one chart, a wall on another; UV coordinates are any float32 numbers."""
+    """A floor and a chair's seat on one chart, a wall on another; arbitrary float32 UV coordinates."""
     vertices, faces = quads(
         [(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)],
         [(0.1, 0.1, 0.5), (0.7, 0.1, 0.5), (0.7, 0.6, 0.5), (0.1, 0.6, 0.5)],
@@ -67,11 +67,16 @@ def scene() -> Scene:
     )
 
 
-def edit_glb(path: Path, edit: Callable[[dict, bytearray], None]) -> None:
-    """Change the JSON header and the binary chunk of a GLB file in place."""
+def chunks(path: Path) -> tuple[dict, bytearray]:
+    """The JSON header and the binary chunk of a GLB file, read without the code under test."""
     content = path.read_bytes()
     size = struct.unpack_from("<I", content, 12)[0]
-    header, binary = json.loads(content[20 : 20 + size]), bytearray(content[28 + size :])
+    return json.loads(content[20 : 20 + size]), bytearray(content[28 + size :])
+
+
+def edit_glb(path: Path, edit: Callable[[dict, bytearray], None]) -> None:
+    """Change the JSON header and the binary chunk of a GLB file in place."""
+    header, binary = chunks(path)
     edit(header, binary)
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
@@ -81,19 +86,18 @@ def edit_glb(path: Path, edit: Callable[[dict, bytearray], None]) -> None:
 
 def vertex_colors(path: Path) -> np.ndarray:
     """(V, 4) uint16 `COLOR_0` of all meshes of a GLB file, read without the code under test."""
-    content = path.read_bytes()
-    size = struct.unpack_from("<I", content, 12)[0]
-    header, colors = json.loads(content[20 : 20 + size]), []
+    header, binary = chunks(path)
+    colors = []
     for mesh in header["meshes"]:
         accessor = header["accessors"][mesh["primitives"][0]["attributes"]["COLOR_0"]]
         assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)
-        start = 28 + size + header["bufferViews"][accessor["bufferView"]]["byteOffset"]
-        colors.append(np.frombuffer(content, "<u2", 4 * accessor["count"], start).reshape(-1, 4))
+        start = header["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        colors.append(np.frombuffer(binary, "<u2", 4 * accessor["count"], start).reshape(-1, 4))
     return np.concatenate(colors)
 
 
 @pytest.mark.parametrize(("unlit", "double_sided"), [(False, [0, 0, 1, 1, 0, 0]), (True, [0] * 6), (True, [1] * 6)])
-def test_a_scene_comes_back_as_it_was(scene: Scene, tmp_path: Path, unlit: bool, double_sided: list[int]) -> None:
+def test_a_scene_is_read_as_written(scene: Scene, tmp_path: Path, unlit: bool, double_sided: list[int]) -> None:
     scene = dataclasses.replace(scene, unlit=unlit, double_sided=np.array(double_sided, bool))
     write_scene(tmp_path / scene.name, scene)
     back = read_scene(tmp_path / scene.name)
@@ -120,7 +124,7 @@ def test_a_scene_comes_back_as_it_was(scene: Scene, tmp_path: Path, unlit: bool,
 def test_files_follow_the_format(scene: Scene, tmp_path: Path) -> None:
     write_scene(tmp_path / scene.name, scene)
     path = tmp_path / scene.name / "Test.semantic.glb"
-    header, annotation = read_glb(path)
+    header, annotation = chunks(path)[0], read_glb(path)
     assert header["samplers"] == [{"magFilter": 9728, "minFilter": 9728, "wrapS": 33071, "wrapT": 33071}]
     assert all(texture["sampler"] == 0 for texture in header["textures"])
     assert all("KHR_materials_unlit" in material["extensions"] for material in header["materials"])
@@ -145,7 +149,7 @@ def test_files_follow_the_format(scene: Scene, tmp_path: Path) -> None:
 def test_shared_vertices_and_mixed_charts(scene: Scene, tmp_path: Path) -> None:
     """A vertex with two UV coordinates is split; faces are grouped by chart, in their order within it."""
     faces = scene.faces.copy()
-    faces[4:] = [[3, 2, 10], [3, 10, 11]]  # the wall takes two of the floor's vertices
+    faces[4:] = [[3, 2, 10], [3, 10, 11]]  # the wall uses two of the floor's vertices
     order = np.array([4, 0, 2, 5, 3, 1])
     mixed = dataclasses.replace(
         scene, faces=faces[order], face_uv=scene.face_uv[order], face_chart=scene.face_chart[order]
@@ -171,14 +175,14 @@ def test_a_vertex_of_two_instances_has_two_colors(scene: Scene, tmp_path: Path) 
         np.testing.assert_array_equal(corners, [color[owner]] * 3)
 
 
-def test_uv_beyond_a_clamped_texture_is_kept(scene: Scene, tmp_path: Path) -> None:
-    """Clamping is per point: a corner that is clamped would stretch the texture over its face."""
+def test_uv_beyond_a_clamped_texture_is_unchanged(scene: Scene, tmp_path: Path) -> None:
+    """Clamping is per point: clamped corners would stretch the texture over the face."""
     wide = scene.face_uv * 3 - np.float32(1)
     write_scene(tmp_path / scene.name, dataclasses.replace(scene, face_uv=wide))
     np.testing.assert_array_equal(read_scene(tmp_path / scene.name).face_uv, wide)
 
 
-def test_charts_that_look_the_same_remain_two(scene: Scene, tmp_path: Path) -> None:
+def test_equal_charts_stay_separate(scene: Scene, tmp_path: Path) -> None:
     write_scene(tmp_path / scene.name, dataclasses.replace(scene, chart_instance=scene.chart_instance[:1] * 2))
     back = read_scene(tmp_path / scene.name)
     assert len(back.chart_instance) == 2
@@ -186,7 +190,7 @@ def test_charts_that_look_the_same_remain_two(scene: Scene, tmp_path: Path) -> N
 
 
 def test_node_transforms(scene: Scene, tmp_path: Path) -> None:
-    """A moved, mirrored mesh stands where it belongs and still shows its front."""
+    """A moved, mirrored mesh is at its place and shows its front."""
     write_scene(tmp_path / scene.name, scene)
 
     def place(header: dict, _: bytearray) -> None:
@@ -202,7 +206,7 @@ def test_node_transforms(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_plain_photographs(scene: Scene, tmp_path: Path) -> None:
-    """Meshes without a texture keep their colour, be it of the material or of the vertices."""
+    """Meshes without a texture keep their colour, of the material or of the vertices."""
     box = trimesh.creation.box()
     box.visual = trimesh.visual.TextureVisuals(
         material=trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 51, 0, 255])
@@ -215,9 +219,7 @@ def test_plain_photographs(scene: Scene, tmp_path: Path) -> None:
     np.testing.assert_array_equal(second.visual.vertex_colors, ball.visual.vertex_colors)
 
 
-def test_an_earlier_scene_is_replaced_whole_or_kept(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_earlier_scene_is_replaced_atomically(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / scene.name
     write_scene(folder, scene)
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
@@ -240,7 +242,7 @@ def test_an_earlier_scene_is_replaced_whole_or_kept(
     assert len(list(folder.iterdir())) == 4
 
 
-def test_what_cannot_be_written(scene: Scene, tmp_path: Path) -> None:
+def test_scenes_that_cannot_be_written(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="NNNNN-HASH"):
         write_scene(tmp_path / "Test", scene)
     broken = dataclasses.replace(scene.instances[0], name="two\nlines")
@@ -255,7 +257,7 @@ def _positions_nan(header: dict, binary: bytearray) -> None:
 
 def _image_damaged(header: dict, binary: bytearray) -> None:
     view = header["bufferViews"][header["images"][0]["bufferView"]]
-    start = view["byteOffset"] + 45  # past the header: only decoding finds it
+    start = view["byteOffset"] + 45  # after the image's header, so that only decoding fails
     binary[start : start + view["byteLength"] - 45] = bytes(view["byteLength"] - 45)
 
 
@@ -309,9 +311,9 @@ def test_a_damaged_photograph_is_named(scene: Scene, tmp_path: Path) -> None:
     [
         (lambda content: b"", "found 0 bytes"),
         (lambda content: b"<html>not a home at all</html>", "start with b'<htm'"),
-        (lambda content: content[:-1], r"expected \d+ bytes, as its header says, found \d+"),
-        (lambda content: content[:30], r"expected \d+ bytes, as its header says, found 30"),
-        (lambda content: content + b"\0", r"expected \d+ bytes, as its header says, found \d+"),
+        (lambda content: content[:-1], r"expected \d+ bytes, by its header, found \d+"),
+        (lambda content: content[:30], r"expected \d+ bytes, by its header, found 30"),
+        (lambda content: content + b"\0", r"expected \d+ bytes, by its header, found \d+"),
         (lambda content: content[:4] + b"\1" + content[5:], "found version 1"),
         (lambda content: content[:20] + b"]" + content[21:], "JSON"),
         (None, "No such file"),
@@ -354,7 +356,7 @@ def test_any_damage_is_read_or_named(scene: Scene, tmp_path: Path, data: st.Data
 def listed(tmp_path: Path, *rows: str, first: str = FIRST_LINE) -> tuple[Instance, ...]:
     path = tmp_path / "names.semantic.txt"
     path.write_text("\n".join([first, *rows]), encoding="utf-8")
-    return read_instances(path)
+    return read_instances(path)[0]
 
 
 def test_rows_of_instances(tmp_path: Path) -> None:
@@ -383,7 +385,7 @@ GOOD = ['1,23694C,"chair",0', '2,23694D,"bed",0']
         ('65536,ABCDEF,"sofa",0', [CHAIR, BED]),
         ('7,000000,"sofa",0', [CHAIR, BED]),
         ('1,ABCDEF,"sofa",0', [CHAIR, BED]),  # the id of another colour
-        ('7,23694C,"sofa",0', [BED]),  # which of the two the surface is cannot be known
+        ('7,23694C,"sofa",0', [BED]),  # the surface is ambiguous
         ('1,23694C,"sofa",0', [BED]),
         ('7,ABCDEF,"caf\udce9",0', [CHAIR, BED]),  # a byte that is not UTF-8
     ],
@@ -393,14 +395,14 @@ def test_a_bad_row_is_reported_and_its_surface_unknown(
 ) -> None:
     path = tmp_path / "names.semantic.txt"
     path.write_bytes("\n".join([FIRST_LINE, *GOOD, "", row]).encode(errors="surrogateescape"))
-    assert list(read_instances(path)) == remaining
+    assert list(read_instances(path)[0]) == remaining
     (record,) = caplog.records
     assert record.getMessage().startswith(f'{path}: expected id,RRGGBB,"name",region')
     assert "found line 5, " in record.getMessage() and "\n" not in record.getMessage()
     assert record.getMessage().endswith("their surfaces are unknown")
     path.write_bytes("\n".join([FIRST_LINE, row]).encode(errors="surrogateescape"))
     if row.startswith(("1,", "7,23")):
-        assert len(read_instances(path)) == 1
+        assert len(read_instances(path)[0]) == 1
     else:
         with pytest.raises(InputError, match=r"names\.semantic\.txt: .*found line 2, "):
             read_instances(path)
@@ -440,7 +442,7 @@ def test_any_text_gives_instances_or_an_input_error(tmp_path: Path, body: bytes)
     path = tmp_path / "names.semantic.txt"
     path.write_bytes(FIRST_LINE.encode() + b"\n" + body)
     try:
-        instances = read_instances(path)
+        instances, _ = read_instances(path)
     except InputError as error:
         assert str(path) in str(error)
         assert "\n" not in str(error)
@@ -452,10 +454,10 @@ def test_any_text_gives_instances_or_an_input_error(tmp_path: Path, body: bytes)
 
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\r\n")))
-def test_every_name_of_one_line_comes_back(scene: Scene, tmp_path: Path, name: str) -> None:
+def test_every_name_of_one_line_is_read_as_written(scene: Scene, tmp_path: Path, name: str) -> None:
     instance = dataclasses.replace(scene.instances[0], name=name)
     write_scene(tmp_path / scene.name, dataclasses.replace(scene, instances=(instance, *scene.instances[1:])))
-    assert read_instances(tmp_path / scene.name / "Test.semantic.txt")[0].name == name
+    assert read_instances(tmp_path / scene.name / "Test.semantic.txt")[0][0].name == name
 
 
 def dataset(root: Path, *scenes: str, annotated: bool = True) -> Path:
@@ -476,7 +478,6 @@ def test_the_official_split(tmp_path: Path) -> None:
     root = dataset(tmp_path, "train/00006-b", "train/00002-a", *(f"val/{n:05d}-v" for n in range(800, 812)))
     dataset(root, "train/00009-unannotated", "val/00899-unannotated", annotated=False)
     split = split_scenes(root)
-    assert not split.dealt
     assert names(split.train) == ["train/00002", "train/00006"]
     assert names(split.validation) == ["val/00800", "val/00802", "val/00803", "val/00808"]
     assert names(split.test) == [f"val/{n:05d}" for n in (801, 804, 805, 806, 807, 809, 810, 811)]
@@ -493,11 +494,10 @@ def test_minival_is_validation_and_never_test(tmp_path: Path) -> None:
     ("count", "train", "validation", "test"),
     [(2, [0], [0], [1]), (3, [0], [1], [2]), (10, list(range(7)), [7], [8, 9])],
 )
-def test_few_homes_are_dealt_out(
+def test_few_scenes_are_split_by_name(
     tmp_path: Path, count: int, train: list[int], validation: list[int], test: list[int]
 ) -> None:
     split = split_scenes(dataset(tmp_path, *(f"val/{n:05d}-v" for n in range(900, 900 + count))))
-    assert split.dealt
     numbers = [[int(folder.name[:5]) - 900 for folder in part] for part in (split.train, split.validation, split.test)]
     assert numbers == [train, validation, test]
 
@@ -540,7 +540,7 @@ def test_real_homes(folder: Path, tmp_path: Path) -> None:
     assert home.double_sided.all()
     assert not home.unlit
 
-    # both colour conventions name the same instance, over more than 99.9 % of the surface: chart rows run down
+    # both colour conventions agree on the instance for more than 99.9 % of the surface: chart rows point down
     a, b, c = np.moveaxis(home.vertices[home.faces].astype(float), 1, 0)
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1)
@@ -570,7 +570,7 @@ def test_real_homes(folder: Path, tmp_path: Path) -> None:
 
 
 def refined(scene: Scene, cuts: int) -> Scene:
-    """The same surface with every triangle cut into `cuts`^2 ones, in the annotation and in the photograph."""
+    """The same surface with every triangle cut into `cuts`^2 ones, in annotation and photograph."""
     i, j = np.array([(i, j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]).T
     index = {place: k for k, place in enumerate(zip(i.tolist(), j.tolist()))}
     upright = [(index[a, b], index[a + 1, b], index[a, b + 1]) for a in range(cuts) for b in range(cuts - a)]
@@ -620,7 +620,7 @@ np.savez(sys.argv[2], faces=len(scene.faces), rgb=photograph, peak_kib=peak_kib,
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux to measure peak memory")
 def test_a_million_triangles_fit_into_four_gib(tmp_path: Path) -> None:
-    """A finely cut home is read, cast and photographed in a process of its own, and looks like the plain home."""
+    """A finely cut home is read, cast and photographed in a separate process, and looks like the plain home."""
     rng = np.random.default_rng(4)
     home = generate_home("00000-Home", rng)
     x0, y0, x1, y1 = draw_plan(np.random.default_rng(4))[0].inner

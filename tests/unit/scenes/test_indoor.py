@@ -62,13 +62,13 @@ def homes():
 
 
 def triangles(quads):
-    """The quads' triangles that have an area, (F, 3, 3)."""
+    """The quads' triangles with an area, (F, 3, 3)."""
     both = np.asarray(quads, float)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
     return both[np.linalg.norm(np.cross(both[:, 1] - both[:, 0], both[:, 2] - both[:, 0]), axis=1) > 1e-10]
 
 
 def surplus_edges(triangle):
-    """How many directed edges lack their opposite: none on closed, consistently wound surfaces."""
+    """Number of directed edges without their opposite: 0 on closed, consistently wound surfaces."""
     corner = np.unique(np.round(triangle, 5).reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
     edges = Counter(zip(corner.ravel().tolist(), np.roll(corner, -1, axis=1).ravel().tolist()))
     return sum(count != edges[b, a] for (a, b), count in edges.items())
@@ -120,8 +120,8 @@ def test_texels_are_one_centimetre(scene):
     np.testing.assert_allclose(flat[visible], TEXELS_PER_M * length[visible], atol=0.02)
 
 
-def test_what_has_no_texels_is_never_seen(homes):
-    """Rays from eyes 88 cm and 1.97 m above the floor, outside of furniture, meet no hidden face from its front."""
+def test_hidden_quads_are_never_visible(homes):
+    """Rays from 88 cm and 1.97 m above the floor, outside of furniture, hit no hidden face from its front."""
     home, rng = homes[1], np.random.default_rng(0)
     corner = home.quads.reshape(-1, 3)
     faces = np.arange(len(corner), dtype=np.int32).reshape(-1, 4)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
@@ -130,7 +130,7 @@ def test_what_has_no_texels_is_never_seen(homes):
     normal = np.cross(home.quads[:, 1] - home.quads[:, 0], home.quads[:, 2] - home.quads[:, 0])
 
     def cast(eye, ray):
-        """The quad that each ray meets, and whether it meets its front."""
+        """The first quad on each ray, and whether its front is hit."""
         eye, ray = eye.astype(np.float32), ray.astype(np.float32)
         quad = caster.run(eye, ray, query="INTERSECT", output=True)["primID"] // 2
         return quad, (quad >= 0) & (np.einsum("nc,nc->n", normal[quad], ray) < 0)
@@ -162,7 +162,7 @@ def test_rectangles_do_not_overlap_and_are_padded(homes):
     assert (atlas.rectangle[:, None, [3, 2]] - inner).min() >= PAD_PX - 1e-6
 
 
-def test_instance_image_is_right_all_over_each_face(scene):
+def test_instance_image_agrees_with_each_face(scene):
     """Also half a texel beyond the corners."""
     home = build_home(np.random.default_rng(5))
     quad = scene.faces[:, 0] // 4
@@ -186,7 +186,7 @@ def test_ceilings_face_down_and_are_the_only_open_surfaces(homes):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_every_room_can_be_walked_to(seed):
+def test_every_room_can_be_reached(seed):
     """Flood fill of the floor at 5 cm, free between 2 cm and 1.9 m, eroded by an agent's 15 cm."""
     rooms = draw_plan(np.random.default_rng(seed))
     home = build_home(np.random.default_rng(seed))
@@ -210,20 +210,20 @@ def test_every_room_can_be_walked_to(seed):
         assert reached > 0.12 * room.area, f"{room.kind}: {reached:.1f} of {room.area:.1f} m2"
 
 
-def test_rooms_are_as_full_as_real_ones(homes):
-    """Objects, walls, shares of rooms and means a room of a kind, as measured on HM3DSem (two dozen homes vary)."""
+def test_contents_of_rooms_are_as_in_hm3dsem(homes):
+    """Objects, walls, fractions of rooms and means per kind of room, as in HM3DSem (two dozen homes vary)."""
     found = home_statistics([home.instances for home in homes], [home.kinds for home in homes])
     assert 6 < found.rooms / found.scenes < 9
     assert found.walls == pytest.approx(HM3DSEM.walls, rel=0.2)
     assert found.objects_median == pytest.approx(HM3DSEM.objects_median, rel=0.2)
-    assert found.share["wall"] == found.share["floor"] == 1
-    for label, share in HM3DSEM.share.items():
-        assert found.share[label] == pytest.approx(share, abs=0.2 * share + 0.03), label
+    assert found.fraction["wall"] == found.fraction["floor"] == 1
+    for label, fraction in HM3DSEM.fraction.items():
+        assert found.fraction[label] == pytest.approx(fraction, abs=0.2 * fraction + 0.03), label
     for (kind, label), mean in HM3DSEM.mean.items():
         assert found.mean[kind, label] == pytest.approx(mean, abs=mean / 3 + 0.15), f"{label} in {kind}"
 
 
-def test_furniture_alone_is_twenty_objects_a_room(homes):
+def test_rooms_have_twenty_objects_besides_the_shell(homes):
     sizes = []
     for home in homes:
         objects = Counter(region for name, region in zip(home.names, home.regions) if name not in SHELL)
@@ -231,7 +231,7 @@ def test_furniture_alone_is_twenty_objects_a_room(homes):
     assert np.median(sizes) >= 20
 
 
-def test_a_plan_tells_the_kinds_of_rooms(homes):
+def test_kinds_of_rooms_agree_with_the_floor_plan(homes):
     assert [[room.kind for room in draw_plan(np.random.default_rng(seed))] for seed in range(24)] == [
         home.kinds for home in homes
     ]
@@ -241,7 +241,7 @@ def test_a_plan_tells_the_kinds_of_rooms(homes):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_walls_are_split_at_openings(seed):
-    """One instance a side and one more an opening; below the doors' heads no part of a wall covers an opening."""
+    """One instance per side and one per opening; below the doors' tops no part of a wall covers an opening."""
     room = max(draw_plan(np.random.default_rng(seed)), key=lambda room: len(room.openings))
     items, _ = build_shell(np.random.default_rng(0), room)
     walls = [solid for name, solid in items if name == "wall"]
@@ -258,7 +258,7 @@ def test_walls_are_split_at_openings(seed):
 
 
 def test_things_on_a_top_do_not_overlap():
-    """Also when they are put there in two goes."""
+    """Also if placed in two calls."""
     room = Room("hall", (0, 0, 4, 4), (0.1, 0.1, 3.9, 3.9), (False,) * 4, 2.5, [Opening(0, 1.0, 1.9, 0.0, False)])
     space = Space(np.random.default_rng(0), room)
     table = space.in_the_open(tables.dining_table(space.rng))
@@ -290,7 +290,7 @@ def test_annotation_is_consistent(scene):
 
 
 def test_photograph_shares_the_atlas_and_is_lit(scene):
-    """Charts' textures have the sizes of the instance images; the same wall paint is brighter here, darker there."""
+    """Textures have the sizes of the instance images; the brightness of one wall paint varies."""
     meshes = list(scene.photograph.geometry.values())
     assert [m.visual.material.baseColorTexture.size[::-1] for m in meshes] == [i.shape for i in scene.chart_instance]
     for chart, mesh in enumerate(meshes):

@@ -19,7 +19,7 @@ CAMERA, TEXTURE = CameraConfig(fpv_px=16, bev_px=20), TextureConfig()
 
 
 def rooms_reader() -> SimpleNamespace:
-    """A data set of folders `room-*`, each an empty room whose side in metres is a text file."""
+    """A data set of folders `room-*`, each an empty room with its side in metres in a text file."""
 
     def find_scenes(root: Path) -> dict[str, list[Path]]:
         return {"all": sorted(root.glob("room-*"))}
@@ -60,7 +60,7 @@ def test_another_data_set_is_read_and_recorded(rooms, tmp_path):
     assert len(Shard(tmp_path / "shards/room-0.h5", CAMERA, TEXTURE)) == 2
 
 
-def test_a_folder_that_no_other_reader_knows_is_hm3dsem(rooms, tmp_path):
+def test_hm3dsem_reads_all_other_folders(rooms, tmp_path):
     with pytest.raises(InputError, match="expected a scene folder named NNNNN-HASH, found 'elsewhere'"):
         readers.read_scene(tmp_path / "elsewhere")
     with pytest.raises(InputError, match="expected a dataset folder, found nothing"):

@@ -11,7 +11,7 @@ from zerobev.scenes.statistics import HM3DSEM, home_statistics
 
 
 def scene(*rooms: str, first_region: int = 0) -> tuple[Instance, ...]:
-    """One scene: a comma-separated list of names for each room."""
+    """One scene: a comma-separated list of names per room."""
     rows = [(name, r) for r, names in enumerate(rooms, start=first_region) for name in names.split(", ")]
     return tuple(Instance(i, (i, 0, 0), name, r, label_of(name)) for i, (name, r) in enumerate(rows, start=1))
 
@@ -30,7 +30,7 @@ def test_known_counts():
     assert found.objects_median == 7
     assert found.walls == pytest.approx(2)
     expected = {"wall": 3, "floor": 3, "chair": 2, "sofa": 0, "bed": 2, "plant": 1, "toilet": 1, "tv": 1}
-    assert found.share == pytest.approx({label: count / 3 for label, count in expected.items()})
+    assert found.fraction == pytest.approx({label: count / 3 for label, count in expected.items()})
     assert {key: mean for key, mean in found.mean.items() if mean and key[1] not in ("wall", "floor")} == {
         ("bedroom", "chair"): 1.5, ("bedroom", "bed"): 1.0, ("bedroom", "plant"): 1.5, ("bedroom", "tv"): 0.5,
         ("bathroom", "toilet"): 1.0,
@@ -50,9 +50,9 @@ def test_one_table_names_every_number():
     assert HM3DSEM.numbers["rooms a scene"] == pytest.approx(14.36, abs=0.01)
 
 
-def test_what_belongs_to_no_room_is_left_out():
+def test_instances_without_a_room_are_left_out():
     outside = scene("sofa, wall", first_region=-1)
-    assert home_statistics([*SCENES, outside]).share == home_statistics(SCENES).share
+    assert home_statistics([*SCENES, outside]).fraction == home_statistics(SCENES).fraction
     assert home_statistics([*SCENES, outside]).scenes == 3
     with pytest.raises(InputError, match="none in 1 scenes"):
         home_statistics([outside])

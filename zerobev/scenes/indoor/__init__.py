@@ -1,4 +1,4 @@
-"""Procedural homes that stand in for HM3DSem: furnished, annotated, with baked light and a 1 cm UV atlas."""
+"""Procedural homes in place of HM3DSem: furnished, annotated, with baked light and a UV atlas of 1 cm texels."""
 
 from zerobev.scenes.indoor.home import generate_home
 

@@ -1,4 +1,4 @@
-"""Groups that belong together: a bed and its nightstands, a table and its chairs, a sofa and its table."""
+"""Groups of furniture: a bed and its nightstands, a table and its chairs, a sofa and its table."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ _EVERY_WAY = np.zeros(3)
 
 
 def first(space: Space, designs: Sequence[Design], **where) -> Placed | None:
-    """One of the designs, against a wall; up to two more are tried if it does not fit."""
+    """Place one of the designs against a wall; up to two more are tried if it does not fit."""
     for index in space.rng.permutation(len(designs))[:3]:
         placed = space.against_wall(designs[index](space.rng), **where)
         if placed:
@@ -25,7 +25,7 @@ def first(space: Space, designs: Sequence[Design], **where) -> Placed | None:
 
 
 def _shine(space: Space, placed: Placed, z: float, power: float) -> None:
-    """Light of a lamp whose shade ends at height `z`."""
+    """Add the light of a lamp at height `z`."""
     x, y = placed.to_world(0.0, float(placed.piece.bounds[:, 1].mean()))
     color = np.array([1.0, space.rng.uniform(0.82, 0.97), space.rng.uniform(0.6, 0.92)])
     space.lamps.append(Lamp(np.array([x, y, z]), power * color, _EVERY_WAY))
@@ -60,7 +60,7 @@ def _front_half(placed: Placed):
 
 
 def _around(rng: np.random.Generator, table: Piece, design: Design, seats: int, tuck: float) -> Piece:
-    """`seats` chairs around a table: along both long sides, and at the ends when there are more than four."""
+    """A table with `seats` chairs: along both long sides, and at the ends if there are more than four."""
     (x0, y0, _), (x1, y1, _) = table.bounds
     ends = 2 if seats > 4 else 0
     side = (seats - ends + 1) // 2
@@ -72,7 +72,7 @@ def _around(rng: np.random.Generator, table: Piece, design: Design, seats: int, 
     items = list(table.items)
     seed = int(rng.integers(2**32))
     for x, y, yaw in places:
-        chair = design(np.random.default_rng(seed))  # the chairs of a set are alike
+        chair = design(np.random.default_rng(seed))  # the chairs of a set are identical
         depth = float(chair.bounds[1, 1]) + rng.uniform(0.0, 0.12)
         yaw += rng.uniform(-0.08, 0.08)
         items += chair.moved(x + np.sin(yaw) * depth, y - np.cos(yaw) * depth, 0.0, yaw).items
@@ -80,7 +80,7 @@ def _around(rng: np.random.Generator, table: Piece, design: Design, seats: int, 
 
 
 def dining(space: Space, sizes: Sequence[int]) -> Placed | None:
-    """A table with its chairs in the open, laid or with a bowl, sometimes on a rug."""
+    """A table with its chairs away from the walls, with things on it, sometimes on a rug."""
     rng = space.rng
     wanted = int(rng.choice(sizes))
     for seats in (wanted, max(wanted - 2, 2), 2):
@@ -113,7 +113,7 @@ def island(space: Space) -> Placed | None:
 
 
 def lounge(space: Space) -> Placed | None:
-    """A sofa at a wall with a coffee table before it, a rug below both and often something beside it."""
+    """A sofa at a wall, often with a coffee table in front, a rug below both and side tables."""
     rng = space.rng
     sofa = first(space, seating.SOFAS, middle=True, front=0.8) or first(space, seating.SOFAS[:2], front=0.3)
     if sofa is None:
@@ -141,7 +141,7 @@ def lounge(space: Space) -> Placed | None:
 
 
 def television(space: Space, low: Placed | None) -> Placed | None:
-    """A TV on the given cabinet, on its own, on the wall, or on an easel."""
+    """A TV on the given cabinet, on a TV stand, on the wall, or on an easel."""
     rng = space.rng
     style = rng.random()
     if low is None and style < 0.75:
@@ -184,7 +184,7 @@ def workplace(space: Space, screen: float) -> Placed | None:
 
 
 def kitchen_row(space: Space) -> Placed | None:
-    """The longest row of kitchen units that finds a wall."""
+    """The longest row of kitchen units that fits a wall."""
     for length, front in ((3.6, 0.6), (3.0, 0.6), (2.5, 0.6), (2.5, 0.3), (2.0, 0.3), (1.8, 0.1)):
         piece = storage.kitchen_row(space.rng, length + space.rng.uniform(-0.2, 0.1))
         placed = space.against_wall(piece, front=front, corner=True) or space.against_wall(piece, front=front)
@@ -200,13 +200,13 @@ def standing_lamp(space: Space) -> None:
         _shine(space, placed, float(placed.piece.bounds[1, 2]) + 0.08, 0.5)
 
 
-def company(rng: np.random.Generator, share: float, mean: float) -> int:
-    """How many of a thing a room has: none, or in `share` of rooms one or more, so that the mean is `mean`."""
-    return int(rng.random() < share) * (1 + int(rng.poisson(mean / share - 1)))
+def company(rng: np.random.Generator, fraction: float, mean: float) -> int:
+    """Random number of things in a room: one or more in a `fraction` of rooms, else none, with mean `mean`."""
+    return int(rng.random() < fraction) * (1 + int(rng.poisson(mean / fraction - 1)))
 
 
-def greenery(space: Space, share: float, mean: float, *low: Placed | None) -> None:
-    """Plants, in company (`company`): on the floor, on the tops of `low`, under the ceiling."""
+def greenery(space: Space, fraction: float, mean: float, *low: Placed | None) -> None:
+    """Plants (number by `company`): on the floor, on the tops of `low`, below the ceiling."""
     rng = space.rng
 
     def standing() -> object:
@@ -220,20 +220,20 @@ def greenery(space: Space, share: float, mean: float, *low: Placed | None) -> No
         x, y = rng.choice([x0 + 0.4, x1 - 0.4]), rng.choice([y0 + 0.3, y1 - 0.6])
         return space.put(Placed(plants.hanging_plant(rng), float(x), float(y), 0.0), z=space.room.height)
 
-    for _ in range(company(rng, share, mean)):
+    for _ in range(company(rng, fraction, mean)):
         ways = (standing, small, hanging, small)
         start = rng.choice(3, p=(0.5, 0.35, 0.15))
         any(way() for way in ways[start:] + ways[:start])
 
 
-def seats(space: Space, share: float, mean: float, designs: Sequence[Design]) -> None:
-    """Single chairs along the walls, in company (`company`)."""
-    for _ in range(company(space.rng, share, mean)):
+def seats(space: Space, fraction: float, mean: float, designs: Sequence[Design]) -> None:
+    """Single chairs along the walls (number by `company`)."""
+    for _ in range(company(space.rng, fraction, mean)):
         first(space, designs, corner=space.rng.random() < 0.5, front=0.1)
 
 
 def breast(space: Space) -> None:
-    """A chimney breast or boxed pipes: a piece of wall that stands out, and is annotated on its own."""
+    """A chimney breast or boxed pipes: a protruding piece of wall, annotated as an instance."""
     rng = space.rng
     w, d, skin = rng.uniform(0.3, 1.1), rng.uniform(0.12, 0.35), surfaces.wall(rng, space.room.kind)
     solid = Solid().box((-w / 2, w / 2), (0, d), (0, space.room.height - 0.002), skin, hide="btu")
@@ -272,7 +272,7 @@ def mat(space: Space, name: str, w: float, d: float) -> None:
 
 
 def ceiling_light(space: Space) -> None:
-    """A lamp in the middle of the ceiling (two in long rooms); it is off in some rooms that have a window."""
+    """A lamp in the middle of the ceiling (two in long rooms); it is off in some rooms with a window."""
     rng = space.rng
     x0, y0, x1, y1 = space.room.inner
     long = max(x1 - x0, y1 - y0)

@@ -1,26 +1,26 @@
-"""One UV atlas for a home: every quad owns a rectangle, every texel is one centimetre."""
+"""The UV atlas of a home: one rectangle per quad, texels of one centimetre."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-#: Texels a metre, everywhere.
+#: Texels per metre, on all quads.
 TEXELS_PER_M = 100.0
 #: Largest side of a chart, texels.
 CHART_PX = 1024
-#: Texels around each rectangle that carry its owner too, so that a nearest look-up never meets a neighbour.
+#: Texels of the same owner around each rectangle, so that a nearest look-up never reaches a neighbour.
 PAD_PX = 1
 
 
 @dataclass(frozen=True)
 class Atlas:
-    """Where each of Q quads lies in the charts. Rectangles are (row, column, height, width), padding included."""
+    """Positions of Q quads in the charts. Rectangles are (row, column, height, width), padding included."""
 
     chart: np.ndarray  #: (Q,) int16
     rectangle: np.ndarray  #: (Q, 4) int32, texels
     shapes: tuple[tuple[int, int], ...]  #: (rows, columns) of each chart
-    corners: np.ndarray  #: (Q, 4, 2) float64: column and row coordinates of the corners in their chart, texels
-    origin: np.ndarray  #: (Q, 3) float64, metres: the point in space of a rectangle's inner upper left corner
+    corners: np.ndarray  #: (Q, 4, 2) float64: column and row of the corners in their chart, texels
+    origin: np.ndarray  #: (Q, 3) float64, metres: the world point of a rectangle's inner upper left corner
     right: np.ndarray  #: (Q, 3) unit vector along a row
     down: np.ndarray  #: (Q, 3) unit vector along a column
 
@@ -31,7 +31,7 @@ class Atlas:
         return (self.corners / size).astype(np.float32)
 
     def owner_images(self, owner: np.ndarray) -> tuple[np.ndarray, ...]:
-        """One uint16 image a chart, that holds `owner` ((Q,) int) of each quad in its rectangle; 0 elsewhere."""
+        """One uint16 image per chart, with `owner` ((Q,) int) of each quad in its rectangle; 0 elsewhere."""
         images = tuple(np.zeros(shape, np.uint16) for shape in self.shapes)
         for chart, (row, column, height, width), value in zip(self.chart, self.rectangle, owner):
             images[chart][row : row + height, column : column + width] = value
@@ -39,9 +39,9 @@ class Atlas:
 
 
 def unwrap(quads: np.ndarray, hidden: np.ndarray) -> Atlas:
-    """Lay (Q, 4, 3) quads, metres, out in charts; `hidden` ones ((Q,) bool) share one texel each.
+    """Arrange (Q, 4, 3) quads, metres, in charts; a hidden quad ((Q,) bool) has a single texel.
 
-    A quad is laid flat with its first edge horizontal, and keeps its size: 1 m is `TEXELS_PER_M` texels.
+    Quads are flattened with the first edge horizontal and the scale of `TEXELS_PER_M`.
     """
     right = quads[:, 1] - quads[:, 0]
     right = right / np.linalg.norm(right, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What stands in each kind of room, and how often; the numbers follow HM3DSem's rooms."""
+"""Furniture by kind of room, with frequencies as in HM3DSem."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from zerobev.scenes.indoor.space import Space
 
 
 def furnish(rng: np.random.Generator, room: Room) -> tuple[list[Item], list[Lamp]]:
-    """Instances that stand, lie and hang in a room, in the world frame, and its lamps."""
+    """A room's instances apart from its shell, in the world frame, and its lamps."""
     space = Space(rng, room)
     if rng.random() < 0.4 and room.kind != "closet":
         arrange.breast(space)

@@ -21,10 +21,10 @@ from zerobev.scenes.scene import Instance, Scene
 
 @dataclass(frozen=True)
 class Home:
-    """A home before it is unwrapped: Q quads with their owners and materials."""
+    """A home without its atlas: Q quads with their owners and materials."""
 
     kinds: list[str]  #: kind of each room, by region
-    names: list[str]  #: of each instance; instance `i` has id i + 1
+    names: list[str]  #: of each instance; entry i has id i + 1
     regions: list[int]  #: room number of each instance
     quads: np.ndarray  #: (Q, 4, 3) float32, metres
     owner: np.ndarray  #: (Q,) instance id, >= 1
@@ -34,10 +34,10 @@ class Home:
 
     @property
     def instances(self) -> tuple[Instance, ...]:
-        """One row an instance; colours run through a fixed permutation of 24-bit numbers, so they are unique."""
+        """One per instance; colours follow a fixed permutation of 24-bit numbers, so they are unique."""
         rows = []
         for index, (name, region) in enumerate(zip(self.names, self.regions), start=1):
-            code = index * 0x9E3779 % 0x1000000  # odd factor: a bijection, 0 stays 0
+            code = index * 0x9E3779 % 0x1000000  # odd factor: a bijection that maps 0 to 0
             rows.append(Instance(index, (code >> 16, code >> 8 & 255, code & 255), name, region, label_of(name)))
         return tuple(rows)
 
@@ -68,11 +68,10 @@ def build_home(rng: np.random.Generator) -> Home:
 
 
 def generate_home(name: str, rng: np.random.Generator) -> Scene:
-    """A furnished home with its atlas, annotation and photographed textures (paper, Section 5: HM3DSem stands in).
+    """A furnished home with atlas, annotation and photographed textures, in place of HM3DSem (paper, Section 5).
 
-    Rooms, furniture and their numbers follow what was measured on HM3DSem. Light is part of the textures
-    (`unlit`), ceilings face downwards only, every other solid is closed. Texels are 1 cm everywhere.
-    The same state of `rng` gives the same home, byte for byte.
+    Kinds and numbers of rooms and furniture follow HM3DSem's. Light is baked into the textures (`unlit`). Ceilings face
+    down, all other solids are closed. Texels are 1 cm. The same state of `rng` gives the same bytes.
     """
     home = build_home(rng)
     quads = home.quads.astype(np.float64)
@@ -101,7 +100,7 @@ def generate_home(name: str, rng: np.random.Generator) -> Scene:
 
 
 def _triangles(quads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(F, 3) int32 faces over the quads' corners, (F,) their quads, (F, 3) their corners; none without area."""
+    """(F, 3) int32 faces over the quads' corners, (F,) their quads, (F, 3) their corners; no face without area."""
     corner = np.tile([[0, 1, 2], [0, 2, 3]], (len(quads), 1))
     quad = np.repeat(np.arange(len(quads)), 2)
     is_triangle = (quads[:, 2] == quads[:, 3]).all(axis=1)
@@ -114,9 +113,9 @@ def _triangles(quads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _photograph(
     atlas: Atlas, vertices: np.ndarray, faces: np.ndarray, face_chart: np.ndarray, textures: list[np.ndarray]
 ) -> trimesh.Scene:
-    """One textured geometry a chart."""
+    """One textured geometry per chart."""
     scene = trimesh.Scene()
-    uv = atlas.uv.reshape(-1, 2) * [1, -1] + [0, 1]  # image formats put v = 0 at the bottom
+    uv = atlas.uv.reshape(-1, 2) * [1, -1] + [0, 1]  # trimesh has v = 0 at the bottom
     for chart, texture in enumerate(textures):
         used, local = np.unique(faces[face_chart == chart], return_inverse=True)
         material = PBRMaterial(

@@ -1,7 +1,6 @@
-"""Baked light: direct light of lamps and windows with shadows, and light that surfaces hand on to each other.
+"""Baked light: direct light of lamps and windows with shadows, and light reflected between surfaces.
 
-Everything is diffuse. Light is computed at the cells of a coarse grid on every quad, and is drawn over
-the quad by linear interpolation.
+All surfaces are diffuse. Light is computed at the cells of a coarse grid on each quad and linearly interpolated.
 """
 
 from dataclasses import dataclass
@@ -12,27 +11,27 @@ from embreex.rtcore_scene import EmbreeScene
 
 #: Side of a cell of the light map, metres.
 CELL_M = 0.14
-#: Directions in which each cell looks for light of other surfaces.
+#: Directions per cell for the light of other surfaces.
 DIRECTIONS = 8
-#: Light weaker than this (where 1 is well lit) casts no shadow ray.
+#: Light weaker than this (1 is well lit) is ignored, without a shadow ray.
 FAINT = 0.02
-#: Light that is everywhere: what more reflections would add.
+#: Uniform light in place of further reflections.
 AMBIENT = np.float32(0.02)
 _LIFT_M = 2e-3
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A small source of light; `facing` is (0, 0, 0) for one that shines in every direction."""
+    """A small light source; `facing` is (0, 0, 0) if it shines in all directions."""
 
     position: np.ndarray  #: (3,) metres
-    power: np.ndarray  #: (3,) linear RGB: irradiance it gives at 1 m, head on
-    facing: np.ndarray  #: (3,) unit vector of a window's inner side
+    power: np.ndarray  #: (3,) linear RGB: irradiance at 1 m, perpendicular to the light
+    facing: np.ndarray  #: (3,) unit vector from a window into the room
 
 
 @dataclass(frozen=True)
 class LightMap:
-    """Linear RGB irradiance at the cells of each quad; a surface of albedo a shows the colour a * light."""
+    """Linear RGB irradiance at the cells of each quad; a surface of albedo a has the colour a * light."""
 
     start: np.ndarray  #: (Q + 1,) int: the cells of quad q are start[q]:start[q + 1], row by row
     shape: np.ndarray  #: (Q, 2) int: rows and columns of cells
@@ -52,7 +51,7 @@ def bake(
 
     origin, right, down: (Q, 3) frames of their rectangles; size_m: (Q, 2) height and width of those;
     faces: (F, 3) int32 triangles of the quads' corners; albedo: (Q, 3) linear RGB; hidden: (Q,) bool,
-    quads that stay dark; opaque: (Q,) bool, quads that stop light (lamp shades do not).
+    quads without light; opaque: (Q,) bool, quads that block light (lamp shades do not).
     """
     shape = np.where(hidden[:, None], 1, np.maximum(np.ceil(size_m / CELL_M), 1)).astype(np.int64)
     count = np.where(hidden, 0, shape.prod(axis=1))
@@ -90,7 +89,7 @@ def bake(
 
 
 def _smooth(light: np.ndarray, quad, row, column, start, shape) -> np.ndarray:
-    """Each cell's mean with its neighbours on the same quad: 3 x 3 cells look into evenly turned directions."""
+    """Mean over 3 x 3 cells of the same quad, which have evenly rotated directions."""
     total = np.zeros_like(light)
     for up in (-1, 0, 1):
         near_row = np.clip(row + up, 0, shape[quad, 0] - 1)
@@ -100,7 +99,7 @@ def _smooth(light: np.ndarray, quad, row, column, start, shape) -> np.ndarray:
 
 
 def _direct(scene: EmbreeScene, point: np.ndarray, normal: np.ndarray, lamps: list[Lamp]) -> np.ndarray:
-    """(N, 3) irradiance from lamps that each point can see."""
+    """(N, 3) irradiance from the lamps visible at each point."""
     light = np.zeros((len(point), 3), np.float32)
     for lamp in lamps:
         ray = lamp.position.astype(np.float32) - point
@@ -119,7 +118,7 @@ def _direct(scene: EmbreeScene, point: np.ndarray, normal: np.ndarray, lamps: li
 
 
 def _looked_at(scene, quad_of_face, point, normal, turn, start, shape, origin, right, down, step) -> np.ndarray:
-    """(N, DIRECTIONS) cell that each point sees in each direction, turned by `turn` (N,); `start[-1]` is none."""
+    """(N, DIRECTIONS) cell visible from each point per direction, rotated by `turn` (N,); `start[-1]` for none."""
     index = np.arange(DIRECTIONS) + 0.5
     radius, angle = np.sqrt(index / DIRECTIONS), index * np.pi * (3 - np.sqrt(5))  # Vogel's spiral: cosine-weighted
     helper = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])

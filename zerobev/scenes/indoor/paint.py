@@ -1,4 +1,4 @@
-"""The photographed textures: albedo times baked light, texel by texel."""
+"""The photographed textures: albedo times baked light per texel."""
 
 from functools import lru_cache
 
@@ -9,15 +9,15 @@ from zerobev.scenes.indoor.atlas import TEXELS_PER_M, Atlas
 from zerobev.scenes.indoor.light import LightMap
 from zerobev.scenes.indoor.solids import Material
 
-#: A camera's response: light times `EXPOSURE`, compressed so that very bright places keep their drawing.
+#: Tone mapping: light times `EXPOSURE`, with highlights compressed by `SHOULDER`.
 EXPOSURE, SHOULDER = np.float32(1.5), np.float32(0.9)
 
 
 def paint(atlas: Atlas, hidden: np.ndarray, materials: list[Material], light: LightMap) -> list[np.ndarray]:
-    """One (rows, columns, 3) uint8 sRGB image a chart.
+    """One (rows, columns, 3) uint8 sRGB image per chart.
 
-    Light is linear and colours are sRGB with a gamma of 2, so that the root of the light multiplies the
-    colour. Patterns are laid by world coordinates: neighbouring quads of one plane continue each other.
+    Light is linear and colours are sRGB with a gamma of 2, so that colours are multiplied by the root of the light.
+    Patterns are aligned to world coordinates, so that they continue across neighbouring quads of a plane.
     """
     planes = [np.zeros((3, *shape), np.uint8) for shape in atlas.shapes]
     exposed = light.light.T * EXPOSURE / (1 + SHOULDER * light.light.T)
@@ -45,7 +45,7 @@ def paint(atlas: Atlas, hidden: np.ndarray, materials: list[Material], light: Li
 
 
 def _spread(cells: np.ndarray, shape: list[int], height: int, width: int) -> np.ndarray:
-    """(3, rows * columns) cells, drawn over (3, height, width) texels by linear interpolation."""
+    """(3, rows * columns) cells, linearly interpolated to (3, height, width) texels."""
     rows, columns = shape
     if rows == columns == 1:
         return cells[:, :, None]

@@ -1,25 +1,25 @@
-"""Floor plans: rooms that tile a rectangle, doors that connect all of them, windows to the outside."""
+"""Floor plans: rooms that tile a rectangle, doors that connect all rooms, windows in outer walls."""
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-#: Thickness of a room's own half of an inner wall, and of an outer wall, metres.
+#: Thickness of a room's half of an inner wall, and of an outer wall, metres.
 INNER_M, OUTER_M = 0.06, 0.24
-#: Height of every door and window head, metres; a wall is a beam above it and pieces below it.
+#: Height of the top of doors and windows, metres; a wall is a beam above it and parts below it.
 HEAD_M = 1.98
-#: Free floor before a door for another one's leaf to stand clear of, metres.
+#: Depth of the floor in front of a door without another door's leaf, metres.
 _LANDING_M = 0.95
-#: Kinds of rooms, from the one that gets the most area to the one that gets the least.
+#: Kinds of rooms, by area, the largest first.
 KINDS = ("living room", "dining room", "kitchen", "bedroom", "office", "hall", "bathroom", "laundry room", "closet")
 _SOCIAL = ("living room", "dining room", "kitchen", "hall")
 _FIRST = ("living room", "kitchen", "bathroom", "bedroom")
-#: What the other rooms are; these weights make chairs, beds, toilets, ... as common as in HM3DSem's rooms.
+#: Probabilities of the kinds of further rooms, for frequencies of chairs, beds, toilets, ... as in HM3DSem's rooms.
 _LATER = {
     "bedroom": 0.22, "bathroom": 0.15, "hall": 0.2, "dining room": 0.08, "office": 0.11, "closet": 0.14,
     "laundry room": 0.1,
 }  # fmt: skip
-#: How often a home has 4, 5, ..., 10 rooms.
+#: Probabilities of 4, 5, ..., 10 rooms.
 _COUNTS = (0.05, 0.08, 0.12, 0.17, 0.2, 0.2, 0.18)
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1, metres
@@ -34,7 +34,7 @@ class Opening:
     end: float
     sill: float  #: metres; 0 for doors
     window: bool
-    leaf: int = 0  #: an open door leaf stands in this room, hinged at the start (-1) or the end (1) of the opening
+    leaf: int = 0  #: an open door leaf in this room, hinged at the start (-1) or the end (1) of the opening; 0: none
 
 
 @dataclass
@@ -56,7 +56,7 @@ class Room:
 
 
 def draw_plan(rng: np.random.Generator) -> list[Room]:
-    """A home of 4 to 10 rooms; every room can be reached from every other one through doors."""
+    """A home of 4 to 10 rooms, all connected by doors."""
     while True:
         rectangles, footprint = _split(rng, int(rng.choice(np.arange(4, 11), p=_COUNTS)))
         rooms = _rooms(rng, rectangles, footprint)
@@ -90,14 +90,14 @@ def along(room: Room, opening: Opening) -> tuple[float, float]:
 
 
 def leaf_span(room: Room, opening: Opening) -> tuple[float, float]:
-    """Where an open door leaf stands along its wall, in the wall's local frame."""
+    """Start and end of an open door leaf along its wall, in the wall's local frame."""
     start, end = along(room, opening)
     at_start = (opening.leaf < 0) != (opening.side in (2, 3))
     return (start + 0.005, start + 0.045) if at_start else (end - 0.045, end - 0.005)
 
 
 def floor_before(room: Room, side: int, start: float, end: float, depth: float) -> Rectangle:
-    """The floor from `start` to `end` along a wall and `depth` metres before it, in the world."""
+    """The floor from `start` to `end` along a wall and to `depth` metres in front of it, in the world."""
     (x, y, _), yaw, _ = side_frame(room, side)
     c, s = np.cos(yaw), np.sin(yaw)
     corners = np.array([[x + c * t - s * far, y + s * t + c * far] for t in (start, end) for far in (0.0, depth)])
@@ -105,7 +105,7 @@ def floor_before(room: Room, side: int, start: float, end: float, depth: float) 
 
 
 def leaf_floor(room: Room, opening: Opening) -> Rectangle:
-    """The floor that an open door leaf takes, with its handles."""
+    """The floor below an open door leaf and its handles."""
     start, end = leaf_span(room, opening)
     return floor_before(room, opening.side, start - 0.06, end + 0.06, opening.end - opening.start + 0.05)
 
@@ -116,7 +116,7 @@ def overlap(a: Rectangle, b: Rectangle) -> bool:
 
 
 def _without_clashes(room: Room) -> list[Opening]:
-    """Openings of a room, less the leaves that would stand before another door or reach across the room."""
+    """A room's openings, without leaves in front of another door or in a shallow room."""
     doors = [o for o in room.openings if not o.window]
     kept = []
     for opening in room.openings:
@@ -157,7 +157,7 @@ def _split(rng: np.random.Generator, count: int) -> tuple[list[Rectangle], Recta
 
 
 def _rooms(rng: np.random.Generator, rectangles: list[Rectangle], footprint: Rectangle) -> list[Room]:
-    """Give each rectangle a kind, by area, and inset it by its walls; a corridor is a hall."""
+    """Assign a kind to each rectangle, by area, and inset it by its walls; a corridor is a hall."""
     corridor = rectangles[0][3] - rectangles[0][1] < 1.9 and len(rectangles) >= 6
     kinds = list(_FIRST) + ["hall"] * corridor
     kinds += list(rng.choice(list(_LATER), len(rectangles) - len(kinds), p=list(_LATER.values())))
@@ -178,7 +178,7 @@ def _rooms(rng: np.random.Generator, rectangles: list[Rectangle], footprint: Rec
 
 
 def _shared(a: Room, b: Room) -> tuple[int, float, float] | None:
-    """The side of `a` that touches `b`, and the part of it that both rooms' floors share; None if too short."""
+    """The side of `a` that touches `b`, and the start and end of their common wall; None if too short."""
     for side, (mine, its, axis) in enumerate(((1, 3, 0), (2, 0, 1), (3, 1, 0), (0, 2, 1))):
         if abs(a.outer[mine] - b.outer[its]) < 1e-9:
             start = max(a.inner[axis], b.inner[axis])
@@ -189,7 +189,7 @@ def _shared(a: Room, b: Room) -> tuple[int, float, float] | None:
 
 
 def _doors(rng: np.random.Generator, rooms: list[Room]) -> list[tuple[int, int, int, float, float]] | None:
-    """A spanning tree of doors that keeps bathrooms and bedrooms at its leaves, and some more between social rooms."""
+    """A spanning tree of doors, with bathrooms and bedrooms as leaves, and further doors between social rooms."""
     dislike = {"bathroom": 4.0, "closet": 4.0, "laundry room": 3.0, "bedroom": 1.5, "office": 1.0, "hall": -1.0}
     pairs = []
     for i, a in enumerate(rooms):
@@ -213,7 +213,7 @@ def _doors(rng: np.random.Generator, rooms: list[Room]) -> list[tuple[int, int, 
 
 
 def _windows(rng: np.random.Generator, room: Room) -> list[Opening]:
-    """At most one window (two on long walls) in each outer wall; a kitchen needs walls and has one only."""
+    """At most one window (two in long walls) per outer wall; a kitchen has only one, because it needs walls."""
     windows: list[Opening] = []
     for side in range(4):
         axis = 0 if side in (0, 2) else 1

@@ -1,4 +1,4 @@
-"""What encloses a room: floor, ceiling, walls with their openings, door frames, windows."""
+"""The shell of a room: floor, ceiling, walls with their openings, door frames, windows."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ Item = tuple[str, Solid]
 
 
 def build_shell(rng: np.random.Generator, room: Room) -> tuple[list[Item], list[Lamp]]:
-    """Instances of a room's shell, in the world frame, and the light that falls in through its windows."""
+    """Instances of a room's shell, in the world frame, and the daylight of its windows."""
     floor, wall = surfaces.floor(rng, room.kind), surfaces.wall(rng, room.kind)
     trim = surfaces.two_tone("plain", (0.93, 0.92, 0.9), 0.95) if rng.random() < 0.7 else surfaces.wood(rng)
     day = rng.uniform(1.2, 3.5) * np.array([0.95, 1.0, 1.08])
@@ -48,12 +48,12 @@ def _ceiling(room: Room, material: Material) -> Solid:
 
 
 def _walls(room: Room, side: int, length: float, openings: list, wall: Material, trim: Material) -> list[Solid]:
-    """The wall of one side, as annotators split it: from each opening's end to the next one's, with skirting.
+    """The wall of one side, split as in HM3DSem: from the end of each opening to the end of the next, with skirting.
 
-    The part before an opening has the lintel over it, and the parapet below it if it is a window.
+    The part with an opening includes the lintel above it, and the parapet below it if it is a window.
     """
     depth = OUTER_M if room.outside[side] else INNER_M
-    before = OUTER_M if room.outside[side - 1] else INNER_M  # walls 1 and 3 stand between 0 and 2
+    before = OUTER_M if room.outside[side - 1] else INNER_M  # walls 1 and 3 are between 0 and 2
     after = OUTER_M if room.outside[(side + 1) % 4] else INNER_M
     first, last = (-before, length + after) if side in (0, 2) else (0.0, length)
     parts, at = [], first
@@ -77,7 +77,7 @@ def _skirting(solid: Solid, start: float, end: float, trim: Material) -> None:
 
 
 def _door_frame(start: float, end: float, trim: Material) -> Solid:
-    """A casing around the opening, on this room's side."""
+    """A frame around the opening, on this room's side."""
     solid = Solid()
     solid.box((start - 0.07, start), (0.0, 0.02), (0.0, HEAD_M), trim, hide="b")
     solid.box((end, end + 0.07), (0.0, 0.02), (0.0, HEAD_M), trim, hide="b")
@@ -85,7 +85,7 @@ def _door_frame(start: float, end: float, trim: Material) -> Solid:
 
 
 def _door_leaf(rng: np.random.Generator, room: Room, opening: Opening, trim: Material) -> Solid:
-    """A leaf at right angles to its wall, with panels and a handle."""
+    """An open leaf, perpendicular to its wall, with panels and a handle."""
     x0, x1 = leaf_span(room, opening)
     width, skin = opening.end - opening.start, trim if rng.random() < 0.5 else surfaces.lacquer_or_wood(rng)
     solid = Solid().box((x0, x1), (0.025, width), (0.01, HEAD_M - 0.01), skin)
@@ -97,7 +97,7 @@ def _door_leaf(rng: np.random.Generator, room: Room, opening: Opening, trim: Mat
 
 
 def _window(rng: np.random.Generator, start: float, end: float, sill: float, trim: Material) -> Solid:
-    """A bright pane deep in the wall, its frame, and a sill board."""
+    """A bright recessed pane, its frame, and a sill."""
     back = -OUTER_M + 0.02
     red, green, blue = (float(np.clip(c * rng.uniform(0.85, 1.05), 0, 1)) for c in _SKY)
     sky = surfaces.glowing((red, green, blue))
@@ -115,7 +115,7 @@ def _window(rng: np.random.Generator, start: float, end: float, sill: float, tri
 
 
 def _daylight(start: float, end: float, sill: float, origin, yaw: float, day: np.ndarray) -> list[Lamp]:
-    """A window as one or two small lamps just inside it, that shine into the room only."""
+    """A window as one or two small lamps in front of its pane, which shine only into the room."""
     right, inward = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
     columns = 2 if end - start > 1.1 else 1
     lamps = []

@@ -1,8 +1,7 @@
-"""Closed solids made of planar quads, and the materials they are made of.
+"""Closed solids of planar quads, and their materials.
 
-Everything in a home is a set of planar convex quads (a triangle repeats its last corner), so that each
-quad can own one rectangle of the UV atlas. Corners run counter-clockwise seen from outside, and the
-first edge is the texture's horizontal.
+A home is a set of planar convex quads (a triangle repeats its last corner), so that each quad has one rectangle of the
+UV atlas. Corners are counter-clockwise seen from outside; the first edge is horizontal in the texture.
 """
 
 import math
@@ -12,9 +11,9 @@ import numpy as np
 
 #: Corners of a box's faces; 0-3 is the lower rectangle counter-clockwise from (-x, -y), 4-7 the upper one.
 _BOX = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7], [3, 2, 1, 0]])
-#: One letter for each face of a box, in the same order: back, right, front, left, top, underside.
+#: One letter per face of a box, in the same order: back, right, front, left, top, underside.
 _SIDES = "brfltu"
-#: Undersides lower than this are below every eye; they get no room in the atlas.
+#: Undersides lower than this are below all cameras; they have no area in the atlas.
 _EYE_M = 0.85
 
 Span = tuple[float, float]
@@ -22,12 +21,12 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True)
 class Material:
-    """A pattern that blends two sRGB colours, and whether it shines by itself."""
+    """A pattern that blends two sRGB colours."""
 
     pattern: str  #: a key of `surfaces.PATTERNS`
-    color: tuple[float, float, float]  #: sRGB in [0, 1] where the pattern is 0
-    second: tuple[float, float, float]  #: sRGB in [0, 1] where the pattern is 1
-    glow: bool = False  #: shown at full brightness, whatever the light
+    color: tuple[float, float, float]  #: sRGB in [0, 1] for a pattern of 0
+    second: tuple[float, float, float]  #: sRGB in [0, 1] for a pattern of 1
+    glow: bool = False  #: shown at full brightness, independent of light
 
 
 class Solid:
@@ -44,7 +43,7 @@ class Solid:
         self._materials.append(material)
 
     def quad(self, corners: np.ndarray, material: Material) -> "Solid":
-        """One (4, 3) quad that encloses nothing; seen from one side only."""
+        """Add one open (4, 3) quad, visible from its front only."""
         self._add(corners[None], material)
         return self
 
@@ -59,9 +58,9 @@ class Solid:
         lean: tuple[float, float] = (0.0, 0.0),
         taper: float = 1.0,
     ) -> "Solid":
-        """A box; its upper rectangle is scaled by `taper` and moved by `lean` (metres in x and y).
+        """Add a box; its upper rectangle is scaled by `taper` and moved by `lean` (metres in x and y).
 
-        `hide` names faces that nobody can see: (b)ack -y, (r)ight +x, (f)ront +y, (l)eft -x, (t)op, (u)nderside.
+        `hide` names invisible faces: (b)ack -y, (r)ight +x, (f)ront +y, (l)eft -x, (t)op, (u)nderside.
         """
         (x0, x1), (y0, y1), (z0, z1) = x, y, z
         mx, my = (x0 + x1) / 2 + lean[0], (y0 + y1) / 2 + lean[1]
@@ -74,7 +73,7 @@ class Solid:
     def lathe(
         self, profile: list[tuple[float, float]], center: tuple[float, float], material: Material, sides: int = 8
     ) -> "Solid":
-        """A surface of revolution about the vertical through `center`; `profile` is (radius, z) from below upwards."""
+        """Add a surface of revolution about the vertical through `center`; `profile` is (radius, z), from below."""
         angle = np.arange(sides) * (2 * math.pi / sides) + math.pi / sides
         circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], axis=1)
         rings = [np.array([*center, z]) + radius * circle for radius, z in profile]
@@ -82,7 +81,7 @@ class Solid:
         return self
 
     def rod(self, start, end, radius: float, material: Material, sides: int = 6) -> "Solid":
-        """A round bar from `start` to `end` (x, y, z)."""
+        """Add a round bar from `start` to `end` (x, y, z)."""
         start, end = np.asarray(start, float), np.asarray(end, float)
         axis = (end - start) / np.linalg.norm(end - start)
         helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
@@ -94,13 +93,13 @@ class Solid:
         return self
 
     def _rings(self, rings: list[np.ndarray], radii: list[float], material: Material) -> None:
-        """The skin between consecutive rings, closed by a lid wherever the first or last radius is not zero."""
+        """Add the surface between consecutive rings, with a lid if the first or last radius is not zero."""
         sides = len(rings[0])
         after = np.roll(np.arange(sides), -1)
         for low, high, r_low, r_high in zip(rings[:-1], rings[1:], radii[:-1], radii[1:]):
             if r_low > 0:
                 self._add(np.stack([low, low[after], high[after], high], axis=1), material)
-            elif r_high > 0:  # a tip below: start on the upper edge, so that the first edge has a length
+            elif r_high > 0:  # a tip below: start on the upper edge, because the first edge needs a length
                 self._add(np.stack([high[after], high, low, low], axis=1), material)
         fan = np.array([[0, i, i + 1, i + 2] for i in range(1, sides - 2, 2)])
         if radii[-1] > 0:
@@ -109,11 +108,11 @@ class Solid:
             self._add(rings[0][fan][:, ::-1], material)
 
     def leaf(self, base, tip, width: float, material: Material) -> "Solid":
-        """A thin folded leaf (a flat tetrahedron) from `base` to `tip`, `width` metres wide."""
+        """Add a thin folded leaf (a flat tetrahedron) from `base` to `tip`, `width` metres wide."""
         base, tip = np.asarray(base, float), np.asarray(tip, float)
         along = tip - base
         x, y, z = along.tolist()
-        side = np.array([y, -x, 0.0] if math.hypot(x, y) > 1e-6 else [1.0, 0.0, 0.0])  # level, across the leaf
+        side = np.array([y, -x, 0.0] if math.hypot(x, y) > 1e-6 else [1.0, 0.0, 0.0])  # horizontal, across the leaf
         side *= width / 2 / np.linalg.norm(side)
         lift = np.array([side[1] * z, -side[0] * z, side[0] * y - side[1] * x])  # side x along
         middle = base + 0.45 * along + lift * (0.25 * width / np.linalg.norm(lift))
@@ -123,7 +122,7 @@ class Solid:
         return self
 
     def join(self, other: "Solid", at: tuple[float, float, float] = (0, 0, 0), yaw: float = 0.0) -> "Solid":
-        """Add `other`, turned by `yaw` about z and moved to `at`."""
+        """Add `other`, rotated by `yaw` (radians) about z and moved to `at`."""
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
         self._quads.extend(quads @ turn + np.asarray(at, float) for quads in other._quads)
         self._hidden.extend(other._hidden)
@@ -132,7 +131,7 @@ class Solid:
 
     @property
     def filled(self) -> bool:
-        """Whether there is anything in it."""
+        """Whether it has a quad."""
         return bool(self._quads)
 
     @property
@@ -142,7 +141,7 @@ class Solid:
 
     @property
     def hidden(self) -> np.ndarray:
-        """(Q,) bool: nobody can see this quad."""
+        """(Q,) bool: whether a quad is invisible from everywhere."""
         return np.concatenate(self._hidden)
 
     @property
@@ -158,6 +157,6 @@ class Solid:
 
 
 def unseen(quads: np.ndarray) -> np.ndarray:
-    """(Q,) bool: undersides ((Q, 4, 3), metres) that lie below every eye."""
+    """(Q,) bool: undersides among quads ((Q, 4, 3), metres) that are below all cameras."""
     normal = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
     return (normal[:, 2] < -0.99 * np.linalg.norm(normal, axis=1)) & (quads[:, :, 2].max(axis=1) < _EYE_M)

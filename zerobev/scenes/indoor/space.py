@@ -1,4 +1,4 @@
-"""A room's free space: where a piece of furniture may stand, hang or lie."""
+"""A room's free space, and the placement of furniture on the floor, on walls and on tops."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,26 +23,26 @@ from zerobev.scenes.indoor.solids import Solid
 
 Design = Callable[[np.random.Generator], Piece]
 
-#: Half the width of a passage that must stay free, metres; agents have a radius of 0.1 to 0.18 m.
+#: Half the minimum width of a passage, metres; agents have a radius of 0.1 to 0.18 m.
 PASSAGE_M = 0.23
-#: Share of a floor that stays free of furniture's bounding rectangles; much of those is free too.
-FREE_SHARE = 0.45
+#: Minimum fraction of the floor outside of the furniture's bounding rectangles.
+FREE_FRACTION = 0.45
 _CELL_M = 0.05
-_DOOR_M = 0.75  # depth of the free floor before a door
-_FLAT_M = 0.06  # what hangs on a wall and is thinner does not narrow a way
+_DOOR_M = 0.75  # depth of the free floor in front of a door
+_FLAT_M = 0.06  # thinner pieces on walls do not block the way
 _TRIES = 40
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A piece in the world; `side` is the wall it stands at, or -1."""
+    """A piece in the world; `side` is its wall, or -1."""
 
     piece: Piece
     x: float
     y: float
     yaw: float
     side: int = -1
-    along: float = 0.0  #: where its middle is on that wall
+    along: float = 0.0  #: position of its middle along that wall, metres
 
     def to_world(self, x: float, y: float) -> tuple[float, float]:
         """World coordinates of a point of the piece's frame."""
@@ -51,7 +51,7 @@ class Placed:
 
 
 class Space:
-    """Keeps what stands in a room, and refuses what would block a door, a window or the way."""
+    """The contents of a room; refuses pieces that would block a door, a window or the way."""
 
     def __init__(self, rng: np.random.Generator, room: Room) -> None:
         self.rng, self.room = rng, room
@@ -77,7 +77,7 @@ class Space:
                 self._door_cells.append(self._cell(*self._at(opening.side, (start + end) / 2, PASSAGE_M + 0.1)))
 
     def _leaf(self, opening: Opening) -> None:
-        """An open door leaf takes a strip of the floor and of the way."""
+        """Reserve the floor of an open door leaf."""
         rectangle = leaf_floor(self.room, opening)
         self._rectangles.append(rectangle)
         low = self._cell(rectangle[0] - PASSAGE_M, rectangle[1] - PASSAGE_M)
@@ -87,7 +87,7 @@ class Space:
     # -- geometry ------------------------------------------------------------------------------------------------
 
     def _at(self, side: int, t: float, depth: float) -> tuple[float, float]:
-        """World point `t` metres along a wall and `depth` before it."""
+        """World point `t` metres along a wall and `depth` metres in front of it."""
         (x, y, _), yaw, _ = side_frame(self.room, side)
         c, s = np.cos(yaw), np.sin(yaw)
         return float(x + c * t - s * depth), float(y + s * t + c * depth)
@@ -103,7 +103,7 @@ class Space:
         return (*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
 
     def _fits(self, rectangle: Rectangle) -> bool:
-        """Inside the room, on no other piece, not before a door."""
+        """Whether a rectangle is inside the room, on no other piece and not in front of a door."""
         x0, y0, x1, y1 = rectangle
         a0, b0, a1, b1 = self.room.inner
         if x0 < a0 + 0.005 or y0 < b0 + 0.005 or x1 > a1 - 0.005 or y1 > b1 - 0.005:
@@ -111,10 +111,10 @@ class Space:
         return not any(overlap(rectangle, other) for other in self._rectangles)
 
     def _leaves_a_way(self, rectangle: Rectangle) -> np.ndarray | None:
-        """The walkable cells without `rectangle`; None if that cuts a door or much of the floor off."""
+        """The walkable cells without `rectangle`; None if a door or much of the floor becomes unreachable."""
         x0, y0, x1, y1 = rectangle
         area = (x1 - x0) * (y1 - y0)
-        if self.used_m2 + area > (1 - FREE_SHARE) * self.room.area:
+        if self.used_m2 + area > (1 - FREE_FRACTION) * self.room.area:
             return None
         (i0, j0), (i1, j1) = self._cell(x0 - PASSAGE_M, y0 - PASSAGE_M), self._cell(x1 + PASSAGE_M, y1 + PASSAGE_M)
         left = self._walkable.copy()
@@ -128,7 +128,7 @@ class Space:
     # -- floor ---------------------------------------------------------------------------------------------------
 
     def put(self, placed: Placed, front: float = 0.0, z: float = 0.0) -> Placed | None:
-        """Stand (or hang, at `z`) a piece exactly there, if it fits; `front` metres before it must be free too."""
+        """Place a piece at its pose and height `z`, if it fits and `front` metres in front of it are free."""
         rectangle = self._footprint(placed)
         if not self._fits(rectangle):
             return None
@@ -149,7 +149,7 @@ class Space:
         self, piece: Piece, *, gap: float = 0.016, front: float = 0.3, sides: Sequence[int] = (0, 1, 2, 3),
         corner: bool = False, middle: bool = False, margin: float = 0.03,
     ) -> Placed | None:  # fmt: skip
-        """Stand a piece with its back to a wall, not before a window that it would cover."""
+        """Place a piece with its back to a random wall, without covering a window."""
         (x0, _, _), (x1, _, _) = piece.bounds
         for _ in range(_TRIES):
             side = sides[int(self.rng.integers(len(sides)))]
@@ -168,7 +168,7 @@ class Space:
         return None
 
     def at_wall(self, piece: Piece, side: int, t: float, *, gap: float = 0.016, front: float = 0.0) -> Placed | None:
-        """Stand a piece at one place of a wall, if it fits."""
+        """Place a piece at position `t` of a wall, if it fits."""
         (x0, _, _), (x1, _, height) = piece.bounds
         if not self._wall_is_free(side, t + x0, t + x1, 0.0, height):
             return None
@@ -179,7 +179,7 @@ class Space:
         return placed
 
     def in_the_open(self, piece: Piece, margin: float = 0.1) -> Placed | None:
-        """Stand a piece anywhere, preferably around the middle of the room."""
+        """Place a piece anywhere, preferably near the middle of the room."""
         x0, y0, x1, y1 = self.room.inner
         lower, upper = piece.bounds
         for attempt in range(_TRIES):
@@ -194,7 +194,7 @@ class Space:
         return None
 
     def lay(self, piece: Piece, x: float, y: float, yaw: float) -> None:
-        """Lay something flat under everything else, if it stays inside the room."""
+        """Lay a flat piece on the floor below others, if it is inside the room."""
         rectangle = self._footprint(Placed(piece, x, y, yaw))
         a0, b0, a1, b1 = self.room.inner
         if rectangle[0] > a0 and rectangle[1] > b0 and rectangle[2] < a1 and rectangle[3] < b1:
@@ -209,7 +209,7 @@ class Space:
         )
 
     def on_wall(self, piece: Piece, z: float, side: int | None = None, t: float | None = None) -> Placed | None:
-        """Hang a piece on a wall with its z = 0 at height `z`, clear of openings and of furniture."""
+        """Hang a piece on a wall with its z = 0 at height `z`, clear of openings and furniture."""
         (x0, _, bottom), (x1, depth, top) = piece.bounds
         for _ in range(_TRIES if t is None else 1):
             wall = int(self.rng.integers(4)) if side is None else side
@@ -233,7 +233,7 @@ class Space:
         return None
 
     def drape(self, name: str, solid: Solid, side: int, t: float, low: float) -> None:
-        """Hang something thin over a window, unless furniture stands there."""
+        """Hang a thin solid at a window, unless furniture is there."""
         (x0, _, _), (x1, _, _) = solid.bounds
         length = side_frame(self.room, side)[2]
         furniture = [w for w in self._on_wall if w[3] == 0.0]
@@ -243,7 +243,7 @@ class Space:
             self.items += Piece([(name, solid)]).moved(x, y, 0.0, side_frame(self.room, side)[1]).items
 
     def on_top(self, placed: Placed | None, designs: Sequence[Design], count: int, z: float = 0.0) -> list[Placed]:
-        """Stand up to `count` small pieces on the tops of a placed one (raised by `z`), side by side."""
+        """Place up to `count` small pieces on the tops of a placed one (raised by `z`), without overlap."""
         done: list[Placed] = []
         if placed is None or not placed.piece.tops:
             return done

@@ -1,7 +1,7 @@
-"""Procedural albedo: patterns in grey, and palettes that make materials of them.
+"""Procedural albedo: grey patterns, and palettes of materials.
 
-A pattern is a square tile of 1 cm texels, in [0, 1]; a material blends its two colours along it. The
-tiles are the same in every home, the colours and the offsets are not.
+A pattern is a square tile of 1 cm texels, in [0, 1]; a material blends its two colours by it. Tiles are the same in
+all homes; colours and offsets differ.
 """
 
 import colorsys
@@ -21,7 +21,7 @@ Color = tuple[float, float, float]
 
 
 def _noise(rng: np.random.Generator, sigma: float | tuple[float, float]) -> np.ndarray:
-    """Smooth periodic noise, rescaled to mean 0.5 and cut to [0, 1]."""
+    """Smooth periodic noise, rescaled to mean 0.5 and clipped to [0, 1]."""
     spectrum = np.fft.rfft2(rng.standard_normal((TILE_PX, TILE_PX), np.float32))
     field = np.fft.irfft2(ndimage.fourier_gaussian(spectrum, sigma, n=TILE_PX))
     return np.clip(0.5 + 0.2 * field / field.std(), 0, 1)
@@ -37,7 +37,7 @@ def _grain(rng: np.random.Generator) -> np.ndarray:
 
 
 def _planks(rng: np.random.Generator, width: int, length: int) -> np.ndarray:
-    """Staggered boards of their own shade, with dark joints."""
+    """Staggered boards with a random shade per board and dark joints."""
     row, column = np.mgrid[:TILE_PX, :TILE_PX]
     board = row // width
     shift = rng.integers(0, length, TILE_PX // width + 1)
@@ -48,7 +48,7 @@ def _planks(rng: np.random.Generator, width: int, length: int) -> np.ndarray:
 
 
 def _tiles(rng: np.random.Generator, height: int, width: int, bond: bool = False) -> np.ndarray:
-    """Tiles with joints of a texel; every other row is shifted by half a tile in `bond`."""
+    """Tiles with joints of one texel; with `bond` every other row is shifted by half a tile."""
     row, column = np.mgrid[:TILE_PX, :TILE_PX]
     line = row // height
     column = column + (line % 2) * (width // 2) * bond
@@ -62,10 +62,10 @@ def _checker(rng: np.random.Generator, side: int) -> np.ndarray:
     return np.clip(((row // side + column // side) % 2) * 0.9 + 0.1 * rng.random(row.shape), 0, 1)
 
 
-def _stripes(rng: np.random.Generator, period: int, share: float) -> np.ndarray:
-    """Upright stripes."""
+def _stripes(rng: np.random.Generator, period: int, fraction: float) -> np.ndarray:
+    """Vertical stripes."""
     column = np.arange(TILE_PX) % period
-    return np.clip((column < share * period) * 0.9 + 0.1 * rng.random((TILE_PX, TILE_PX)), 0, 1)
+    return np.clip((column < fraction * period) * 0.9 + 0.1 * rng.random((TILE_PX, TILE_PX)), 0, 1)
 
 
 def _floral(rng: np.random.Generator) -> np.ndarray:
@@ -91,11 +91,11 @@ def _ornament(rng: np.random.Generator) -> np.ndarray:
 
 
 def _painting(rng: np.random.Generator) -> np.ndarray:
-    """Flat areas with hard borders."""
+    """Uniform areas with sharp borders."""
     return np.floor(_noise(rng, 9.0) * 6) / 5 * 0.9 + 0.1 * _noise(rng, 1.0)
 
 
-#: Every pattern by name; each is drawn once a process, from its own fixed seed.
+#: Every pattern by name; each is drawn once per process, from a fixed seed.
 PATTERNS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "plain": _plain,
     "grain": _grain,
@@ -146,7 +146,7 @@ def two_tone(pattern: str, color: Color, factor: float = 0.8) -> Material:
 
 
 def wood(rng: np.random.Generator, pattern: str = "grain") -> Material:
-    """From white-washed to nearly black."""
+    """Wood from white to nearly black."""
     value = rng.choice([0.28, 0.42, 0.58, 0.74, 0.86])
     return two_tone(pattern, _hsv(rng.uniform(0.05, 0.11), rng.uniform(0.3, 0.65) * (1.15 - value * 0.5), value), 0.68)
 
@@ -159,7 +159,7 @@ def paint(rng: np.random.Generator) -> Material:
 
 
 def lacquer_or_wood(rng: np.random.Generator) -> Material:
-    """What cabinets are made of."""
+    """The material of a cabinet."""
     return wood(rng) if rng.random() < 0.6 else paint(rng)
 
 
@@ -219,7 +219,7 @@ def glowing(color: Color) -> Material:
 
 
 def floor(rng: np.random.Generator, room: str) -> Material:
-    """What a room's floor is made of."""
+    """The material of a room's floor."""
     if room in ("bathroom", "kitchen") or rng.random() < 0.15:
         pattern = rng.choice(["tiles", "large tiles", "small tiles", "checker"])
         base = _hsv(rng.uniform(0, 0.15), rng.uniform(0, 0.25), rng.uniform(0.35, 0.92))
@@ -230,7 +230,7 @@ def floor(rng: np.random.Generator, room: str) -> Material:
 
 
 def wall(rng: np.random.Generator, room: str) -> Material:
-    """What a room's walls are covered with."""
+    """The material of a room's walls."""
     if room == "bathroom" or (room == "kitchen" and rng.random() < 0.3):
         pattern = rng.choice(["tiles", "metro tiles", "small tiles", "plain"])
         return two_tone(str(pattern), _hsv(rng.random(), rng.uniform(0, 0.25), rng.uniform(0.75, 0.97)), 0.8)

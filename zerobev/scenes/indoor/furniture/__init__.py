@@ -1,1 +1,1 @@
-"""Parametric designs. A design takes a random generator and gives a `Piece`."""
+"""Parametric designs. A design takes a random generator and returns a `Piece`."""

@@ -18,7 +18,7 @@ def _bowl(solid: Solid, back: float, depth: float, low: float, white: Material, 
 
 
 def close_coupled_toilet(rng: np.random.Generator) -> Piece:
-    """The cistern stands on the pan."""
+    """A toilet with the cistern on the pan."""
     white, solid, depth = surfaces.ceramic(rng), Solid(), rng.uniform(0.44, 0.5)
     _bowl(solid, 0.17, depth, 0.0, white, surfaces.ceramic(rng) if rng.random() < 0.8 else surfaces.wood(rng))
     solid.box((-0.2, 0.2), (0, 0.17), (0.38, rng.uniform(0.72, 0.8)), white)
@@ -34,7 +34,7 @@ def wall_hung_toilet(rng: np.random.Generator) -> Piece:
 
 
 def built_in_toilet(rng: np.random.Generator) -> Piece:
-    """A pan in front of a boxed cistern that makes a shelf."""
+    """A pan in front of a boxed cistern with a shelf on top."""
     white, solid, box = surfaces.ceramic(rng), Solid(), surfaces.paint(rng)
     solid.box((-0.45, 0.45), (0, 0.2), (0, 1.1), box, hide="bu")
     _bowl(solid, 0.2, 0.5, 0.06, white, white)
@@ -42,7 +42,7 @@ def built_in_toilet(rng: np.random.Generator) -> Piece:
 
 
 def high_cistern_toilet(rng: np.random.Generator) -> Piece:
-    """An old one: the cistern hangs high and a pipe leads down."""
+    """An old toilet with a high cistern and a pipe."""
     white, solid, metal = surfaces.ceramic(rng), Solid(), surfaces.metal(rng)
     _bowl(solid, 0.05, rng.uniform(0.5, 0.56), 0.0, white, surfaces.wood(rng))
     solid.box((-0.22, 0.22), (0, 0.17), (1.55, 1.85), white if rng.random() < 0.5 else surfaces.wood(rng), hide="b")
@@ -85,7 +85,7 @@ def _tap(rng: np.random.Generator, solid: Solid, y: float, z: float) -> None:
 
 
 def bathtub(rng: np.random.Generator) -> Piece:
-    """A tub with a real hollow: rim, walls and floor; often panelled."""
+    """A hollow tub with rim, walls and floor, often panelled."""
     w, d, h, white = rng.uniform(1.5, 1.75), rng.uniform(0.7, 0.8), rng.uniform(0.5, 0.6), surfaces.ceramic(rng)
     solid = Solid().box((-w / 2, w / 2), (0, d), (0, 0.15), white, hide="bu")
     for y in ((0.0, 0.08), (d - 0.08, d)):

@@ -8,7 +8,7 @@ from zerobev.scenes.indoor.solids import Solid
 
 
 def _bedding(rng: np.random.Generator, solid: Solid, w: float, d: float, z: float) -> list:
-    """Mattress and blanket go into `solid`; the pillows are returned as instances."""
+    """Add mattress and blanket to `solid`; returns the pillows as instances."""
     sheet = surfaces.linen(rng)
     blanket = surfaces.fabric(rng) if rng.random() < 0.7 else surfaces.linen(rng)
     top, fold = z + rng.uniform(0.16, 0.24), d * rng.uniform(0.25, 0.5)

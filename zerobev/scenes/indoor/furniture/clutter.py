@@ -12,14 +12,14 @@ WARM = (1.0, 0.93, 0.78)
 
 
 def vase(rng: np.random.Generator) -> Piece:
-    """Turned, of one colour."""
+    """A vase of one colour."""
     r, h = rng.uniform(0.04, 0.1), rng.uniform(0.15, 0.38)
     skin = surfaces.vivid(rng) if rng.random() < 0.6 else surfaces.ceramic(rng)
     return one("vase", Solid().lathe([(r * 0.6, 0), (r, h * 0.4), (r * 0.5, h * 0.8), (r * 0.65, h)], (0, r), skin))
 
 
 def bowl(rng: np.random.Generator) -> Piece:
-    """Sometimes with fruit."""
+    """A bowl, sometimes with fruit."""
     r = rng.uniform(0.09, 0.16)
     solid = Solid().lathe([(r * 0.5, 0), (r, r * 0.55)], (0, r), surfaces.vivid(rng), sides=10)
     items = [("bowl", solid)]
@@ -38,7 +38,7 @@ def bowl(rng: np.random.Generator) -> Piece:
 
 
 def bottle(rng: np.random.Generator) -> Piece:
-    """Wine, soap or shampoo."""
+    """A bottle of wine, soap or shampoo."""
     r, h = rng.uniform(0.025, 0.042), rng.uniform(0.15, 0.32)
     return one(
         "bottle",
@@ -47,17 +47,17 @@ def bottle(rng: np.random.Generator) -> Piece:
 
 
 def cup(rng: np.random.Generator) -> Piece:
-    """Without its handle."""
+    """A cup without its handle."""
     return one("cup", Solid().lathe([(0.032, 0), (0.042, 0.09)], (0, 0.042), surfaces.vivid(rng), sides=8))
 
 
 def plate(rng: np.random.Generator) -> Piece:
-    """For a meal."""
+    """A plate."""
     return one("plate", Solid().lathe([(0.07, 0), (0.125, 0.02)], (0, 0.125), surfaces.ceramic(rng), sides=10))
 
 
 def book_pile(rng: np.random.Generator) -> Piece:
-    """Lying books, each an instance."""
+    """Lying books, one instance per book."""
     items, z = [], 0.0
     for _ in range(int(rng.integers(1, 4))):
         w, d, h = rng.uniform(0.18, 0.28), rng.uniform(0.13, 0.2), rng.uniform(0.015, 0.04)
@@ -69,14 +69,14 @@ def book_pile(rng: np.random.Generator) -> Piece:
 
 
 def box(rng: np.random.Generator) -> Piece:
-    """Cardboard, or coloured."""
+    """A box of cardboard or of a colour."""
     w, d, h = rng.uniform(0.15, 0.35), rng.uniform(0.12, 0.28), rng.uniform(0.08, 0.25)
     skin = surfaces.two_tone("plain", (0.72, 0.56, 0.38), 0.9) if rng.random() < 0.4 else surfaces.vivid(rng)
     return one("box", Solid().box((-w / 2, w / 2), (0, d), (0, h), skin))
 
 
 def photo_frame(rng: np.random.Generator) -> Piece:
-    """A small picture that stands."""
+    """A small standing picture."""
     w, h = rng.uniform(0.1, 0.2), rng.uniform(0.13, 0.24)
     solid = Solid().box((-w / 2, w / 2), (0.03, 0.05), (0, h), surfaces.wood(rng), lean=(0, -0.03))
     solid.box(
@@ -91,7 +91,7 @@ def photo_frame(rng: np.random.Generator) -> Piece:
 
 
 def candle(rng: np.random.Generator) -> Piece:
-    """One to three, on a plate."""
+    """One to three candles on a plate."""
     solid = Solid().lathe([(0.07, 0), (0.07, 0.01)], (0, 0.07), surfaces.metal(rng))
     for k in range(int(rng.integers(1, 4))):
         at = (0.035 * math.cos(2.1 * k), 0.07 + 0.035 * math.sin(2.1 * k))
@@ -100,7 +100,7 @@ def candle(rng: np.random.Generator) -> Piece:
 
 
 def laptop(rng: np.random.Generator) -> Piece:
-    """Open."""
+    """An open laptop."""
     metal, w = surfaces.metal(rng), rng.uniform(0.3, 0.38)
     solid = Solid().box((-w / 2, w / 2), (0.06, 0.28), (0, 0.016), metal)
     solid.box((-w / 2, w / 2), (0.05, 0.06), (0.016, 0.22), metal, lean=(0, -0.05))
@@ -116,14 +116,14 @@ def laptop(rng: np.random.Generator) -> Piece:
 
 
 def keyboard(rng: np.random.Generator) -> Piece:
-    """With a mouse beside it."""
+    """A keyboard with a mouse."""
     skin = surfaces.paint(rng)
     mouse = Solid().box((0.26, 0.32), (0.03, 0.13), (0, 0.03), skin, taper=0.8)
     return Piece([("keyboard", Solid().box((-0.22, 0.22), (0, 0.14), (0, 0.02), skin)), ("mouse", mouse)])
 
 
 def kettle(rng: np.random.Generator) -> Piece:
-    """With its handle."""
+    """A kettle with its handle."""
     metal = surfaces.metal(rng)
     solid = Solid().lathe([(0.09, 0), (0.09, 0.03), (0.065, 0.2), (0.03, 0.23)], (0, 0.09), metal)
     return one(
@@ -147,7 +147,7 @@ def microwave(rng: np.random.Generator) -> Piece:
 
 
 def toaster(rng: np.random.Generator) -> Piece:
-    """Two slots."""
+    """A toaster with two slots."""
     return one("toaster", Solid().box((-0.14, 0.14), (0, 0.17), (0, 0.19), surfaces.metal(rng), taper=0.9))
 
 
@@ -160,7 +160,7 @@ def table_lamp(rng: np.random.Generator) -> Piece:
 
 
 def floor_lamp(rng: np.random.Generator) -> Piece:
-    """Taller than a man sits."""
+    """A floor lamp, higher than a seated person."""
     h, r, metal = rng.uniform(1.4, 1.75), rng.uniform(0.15, 0.22), surfaces.metal(rng)
     solid = (
         Solid().lathe([(r * 0.8, 0), (r * 0.8, 0.02)], (0, r), metal).rod((0, r, 0.02), (0, r, h - 0.2), 0.014, metal)
@@ -194,7 +194,7 @@ def painting(rng: np.random.Generator) -> Piece:
 
 
 def mirror(rng: np.random.Generator) -> Piece:
-    """Framed; it does not reflect."""
+    """A framed mirror without reflections."""
     w, h = rng.uniform(0.45, 0.9), rng.uniform(0.6, 0.95)
     solid = Solid().box((-w / 2, w / 2), (0, 0.02), (0, h), surfaces.metal(rng), hide="b")
     glass = surfaces.two_tone("plain", (0.72, 0.77, 0.8), 1.1)
@@ -202,7 +202,7 @@ def mirror(rng: np.random.Generator) -> Piece:
 
 
 def clock(rng: np.random.Generator) -> Piece:
-    """Round, for a wall."""
+    """A round clock for a wall."""
     r = rng.uniform(0.12, 0.2)
     solid = Solid().rod((0, 0.0, r), (0, 0.03, r), r, surfaces.metal(rng), sides=12)
     return one("clock", solid.rod((0, 0.03, r), (0, 0.034, r), r * 0.88, surfaces.ceramic(rng), sides=12))
@@ -218,7 +218,7 @@ def curtain(rng: np.random.Generator, cloth: Material, w: float, z: tuple[float,
 
 
 def radiator(rng: np.random.Generator) -> Piece:
-    """Ribs below a window."""
+    """A radiator with ribs."""
     w, white = rng.uniform(0.6, 1.2), surfaces.ceramic(rng)
     solid = Solid().box((-w / 2, w / 2), (0.03, 0.07), (0.12, 0.68), white)
     for x in np.arange(-w / 2 + 0.02, w / 2 - 0.05, 0.12):
@@ -247,7 +247,7 @@ def toy(rng: np.random.Generator) -> Piece:
 
 
 def shoes(rng: np.random.Generator) -> Piece:
-    """One pair."""
+    """A pair of shoes."""
     skin, solid = surfaces.vivid(rng), Solid()
     for x in (-0.11, 0.02):
         solid.box((x, x + 0.09), (0, 0.27), (0, 0.05), skin).box(

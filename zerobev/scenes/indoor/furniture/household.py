@@ -1,4 +1,4 @@
-"""What closets and laundry rooms are for: clothes, suitcases, machines and their tools."""
+"""Contents of closets and laundry rooms: clothes, suitcases, machines and tools."""
 
 import numpy as np
 

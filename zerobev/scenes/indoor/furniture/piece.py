@@ -1,4 +1,4 @@
-"""What a design gives: instances in a local frame, and the places on them where smaller things can stand."""
+"""The result of a design: instances in a local frame, and tops for smaller pieces."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,7 +32,7 @@ class Piece:
         return np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
 
     def moved(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> "Piece":
-        """The same piece elsewhere; its tops are dropped."""
+        """The piece at another pose, without its tops."""
         return Piece([(name, Solid().join(solid, (x, y, z), yaw)) for name, solid in self.items])
 
 

@@ -20,7 +20,7 @@ def _crown(
     rng: np.random.Generator, solid: Solid, center: tuple[float, float, float], count: int, length: float,
     leaf: Material, rise: tuple[float, float], width: float,
 ) -> None:  # fmt: skip
-    """Leaves around a point, at angles of `rise` (radians) over the horizon."""
+    """Leaves around a point, at angles of `rise` (radians) above the horizontal."""
     for k in range(count):
         turn = 2.4 * k + rng.uniform(-0.3, 0.3)
         up = rng.uniform(*rise)
@@ -34,7 +34,7 @@ def _potted(
     rng: np.random.Generator, r: float, h: float, count: tuple[int, int], length: tuple[float, float],
     rise: tuple[float, float], slender: float,
 ) -> Piece:  # fmt: skip
-    """A pot and one crown of leaves, which are `slender` times as long as they are wide."""
+    """A pot and one crown of leaves with a ratio of length to width of `slender`."""
     solid, size = Solid(), rng.uniform(*length)
     _pot(rng, solid, r, h)
     _crown(rng, solid, (0, r, h - 0.02), int(rng.integers(*count)), size, surfaces.foliage(rng), rise, size / slender)
@@ -47,7 +47,7 @@ def bushy_plant(rng: np.random.Generator) -> Piece:
 
 
 def tall_plant(rng: np.random.Generator) -> Piece:
-    """A trunk with a crown, about as tall as a man."""
+    """A trunk with a crown, about as tall as a person."""
     solid, r, h, top = Solid(), rng.uniform(0.14, 0.2), rng.uniform(0.25, 0.4), rng.uniform(0.9, 1.5)
     _pot(rng, solid, r, h)
     solid.rod((0, r, h), (rng.uniform(-0.06, 0.06), r, top), 0.018, surfaces.wood(rng), sides=6)
@@ -75,7 +75,7 @@ def small_tree(rng: np.random.Generator) -> Piece:
 
 
 def table_plant(rng: np.random.Generator) -> Piece:
-    """Something small and green for a table or a sill."""
+    """A small plant for a table or a sill."""
     return _potted(rng, rng.uniform(0.05, 0.08), rng.uniform(0.08, 0.13), (8, 14), (0.12, 0.22), (0.4, 1.4), 2.8)
 
 

@@ -23,7 +23,7 @@ def _panel(rng: np.random.Generator, solid: Solid, w: float, y: float, z: float,
 
 
 def wall_tv(rng: np.random.Generator) -> Piece:
-    """Flat on the wall; z = 0 is its lower edge."""
+    """A flat television on the wall; z = 0 is its lower edge."""
     solid = Solid()
     _panel(rng, solid, rng.uniform(0.8, 1.5), 0.03, 0.0)
     solid.box((-0.2, 0.2), (0.0, 0.03), (0.1, 0.35), _BLACK, hide="b")
@@ -31,7 +31,7 @@ def wall_tv(rng: np.random.Generator) -> Piece:
 
 
 def footed_tv(rng: np.random.Generator) -> Piece:
-    """Two feet, to stand on a cabinet."""
+    """A television on two feet, for a cabinet."""
     w, solid = rng.uniform(0.7, 1.3), Solid()
     _panel(rng, solid, w, 0.09, 0.06)
     for x in (-w * 0.32, w * 0.32):
@@ -41,7 +41,7 @@ def footed_tv(rng: np.random.Generator) -> Piece:
 
 
 def pedestal_tv(rng: np.random.Generator) -> Piece:
-    """One column on a plate, to stand on a cabinet."""
+    """A television on one column, for a cabinet."""
     w, solid = rng.uniform(0.6, 1.1), Solid()
     _panel(rng, solid, w, 0.1, 0.1)
     solid.box((-w * 0.2, w * 0.2), (0.0, 0.24), (0.0, 0.015), _BLACK)

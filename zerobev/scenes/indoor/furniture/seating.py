@@ -1,4 +1,4 @@
-"""Chairs, armchairs, sofas; stools, ottomans and benches, which are no chairs."""
+"""Chairs, armchairs and sofas; stools, ottomans and benches, which are not of class chair."""
 
 import math
 
@@ -137,7 +137,7 @@ def lounge_chair(rng: np.random.Generator) -> Piece:
 
 
 def _couch(rng: np.random.Generator, w: float, d: float, seats: int, back: float | None = None) -> Solid:
-    """Base, arms, back and one cushion a seat, on feet or down to the floor."""
+    """Base, arms, back and one cushion per seat, with or without feet."""
     cloth, wood = surfaces.fabric(rng), surfaces.wood(rng)
     cushion = cloth if rng.random() < 0.7 else surfaces.fabric(rng)
     arm, feet, h = rng.uniform(0.1, 0.24), rng.choice([0.0, 0.05, 0.14]), rng.uniform(0.4, 0.46)
@@ -158,7 +158,7 @@ def _couch(rng: np.random.Generator, w: float, d: float, seats: int, back: float
 
 
 def _with_cushions(rng: np.random.Generator, solid: Solid, w: float, h: float = 0.44) -> Piece:
-    """A sofa with some loose cushions, which are instances of their own."""
+    """A sofa with some loose cushions, which are separate instances."""
     items = [("couch", solid)]
     for x in rng.permutation(np.linspace(-w / 2 + 0.42, w / 2 - 0.42, 4))[: rng.integers(0, 4)]:
         cushion = Solid().box((-0.19, 0.19), (0.3, 0.4), (h, h + 0.34), surfaces.fabric(rng), lean=(0, -0.06))

@@ -11,7 +11,7 @@ def _fronts(
     solid: Solid, x: tuple[float, float], y: float, z: tuple[float, float], grid: tuple[int, int],
     front: Material, knob: Material | None,
 ) -> None:  # fmt: skip
-    """Doors or drawers in (columns, rows) before a carcass whose front is at `y`."""
+    """Doors or drawers in (columns, rows) on the front, at `y`, of a carcass."""
     columns, rows = grid
     dx, dz = (x[1] - x[0]) / columns, (z[1] - z[0]) / rows
     for i in range(columns):
@@ -46,7 +46,7 @@ def _chest(rng: np.random.Generator, name: str, w: float, d: float, h: float, gr
 
 
 def nightstand(rng: np.random.Generator) -> Piece:
-    """Beside a bed."""
+    """A nightstand."""
     return _chest(rng, "nightstand", rng.uniform(0.38, 0.52), rng.uniform(0.35, 0.42), rng.uniform(0.45, 0.6), (1, 2))
 
 
@@ -64,7 +64,7 @@ def drawers(rng: np.random.Generator) -> Piece:
 
 
 def sideboard(rng: np.random.Generator) -> Piece:
-    """Wide and low."""
+    """A wide, low cabinet."""
     return _chest(
         rng,
         "cabinet",
@@ -76,23 +76,23 @@ def sideboard(rng: np.random.Generator) -> Piece:
 
 
 def tv_stand(rng: np.random.Generator) -> Piece:
-    """Under a television."""
+    """A cabinet for a television."""
     return _chest(rng, "tv stand", rng.uniform(1.2, 1.8), rng.uniform(0.38, 0.45), rng.uniform(0.42, 0.6), (3, 1))
 
 
 def wardrobe(rng: np.random.Generator) -> Piece:
-    """Two to four tall doors."""
+    """A wardrobe with two to four doors."""
     doors = int(rng.integers(2, 5))
     return _chest(rng, "wardrobe", 0.5 * doors, rng.uniform(0.55, 0.62), rng.uniform(1.95, 2.25), (doors, 1))
 
 
 def shoe_cabinet(rng: np.random.Generator) -> Piece:
-    """Shallow, for a hall."""
+    """A shallow cabinet for a hall."""
     return _chest(rng, "shoe cabinet", rng.uniform(0.6, 0.9), 0.26, rng.uniform(0.8, 1.2), (1, 3))
 
 
 def books(rng: np.random.Generator, width: float, depth: float, room: float) -> Piece:
-    """A row of upright books about `width` metres long; one instance each handful."""
+    """A row of upright books about `width` metres long; an instance is a handful of books."""
     items, x = [], -width / 2
     while x < width / 2 - 0.08:
         bundle, high = Solid(), min(rng.uniform(0.17, 0.27), room - 0.03)

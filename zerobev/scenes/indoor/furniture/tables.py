@@ -27,7 +27,7 @@ def _slab_table(rng: np.random.Generator, name: str, w: float, d: float, h: floa
 
 
 def dining_table(rng: np.random.Generator, seats: int = 4) -> Piece:
-    """A table that `seats` people fit around: two at the ends when more than four."""
+    """A table for `seats` people, two of them at the ends if more than four."""
     side = (seats - 2 * (seats > 4)) // 2
     return _slab_table(
         rng, "table", max(0.75, 0.62 * side + rng.uniform(0.0, 0.2)), rng.uniform(0.78, 0.95), rng.uniform(0.72, 0.77)
@@ -44,7 +44,7 @@ def round_table(rng: np.random.Generator, radius: float = 0.55) -> Piece:
 
 
 def coffee_table(rng: np.random.Generator) -> Piece:
-    """Low, before a sofa."""
+    """A low table for a sofa."""
     if rng.random() < 0.3:
         r, h, skin = rng.uniform(0.3, 0.45), rng.uniform(0.32, 0.45), surfaces.lacquer_or_wood(rng)
         solid = (
@@ -57,13 +57,13 @@ def coffee_table(rng: np.random.Generator) -> Piece:
 
 
 def side_table(rng: np.random.Generator) -> Piece:
-    """Small, beside a seat."""
+    """A small table beside a seat."""
     side = rng.uniform(0.36, 0.5)
     return _slab_table(rng, "side table", side, side, rng.uniform(0.46, 0.6))
 
 
 def console(rng: np.random.Generator) -> Piece:
-    """Narrow, along a wall."""
+    """A narrow table along a wall."""
     return _slab_table(rng, "console table", rng.uniform(0.8, 1.3), rng.uniform(0.28, 0.36), rng.uniform(0.76, 0.86))
 
 
