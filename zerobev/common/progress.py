@@ -1,4 +1,4 @@
-"""Progress of long work: on a terminal, or into the file that `ZEROBEV_PROGRESS` names; never in a notebook."""
+"""Progress of long work: on a terminal, or in the file named by `ZEROBEV_PROGRESS`; never in a notebook."""
 
 import os
 import sys
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def progress(items: Iterable[T], what: str, unit: str, total: int, done: int = 0) -> Iterator[T]:
-    """Yield `items`, showing how many of `total` are done (`done` of them before) and when the rest will be."""
+    """Yield `items` and show the number done out of `total` and the remaining time; `done` were done before."""
     log = os.environ.get("ZEROBEV_PROGRESS")
     if log:
         with Path(log).open("a") as file:
