@@ -496,7 +496,7 @@ def test_valid_arguments_of_project_are_taken(projector: zerobev.Projector) -> N
     modalities += [zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]), zerobev.Flow([[1, 1]], [[1e300, 2]])]
     for image, modality in zip(images * 2, modalities):
         projector.project(image, modality, np.float32(66))
-    wide = next(iter(zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]).images((8, 8)).images))
+    (wide,) = zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]).layers((8, 8))[0].images
     assert wide[:4].all() and not wide[4:].any()  # a box that ends far outside covers all up to the border
 
 
