@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 class InputError(ValueError):
-    """Bad input from the user: the message names the file or argument, what was expected and what was found."""
+    """Bad input from the user: the message is "NAME: expected X, found Y", with a file or an argument as NAME."""
 
 
 class SetupError(InputError):

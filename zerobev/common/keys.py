@@ -26,7 +26,7 @@ def changed(value: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Plain data with every field of every dataclass, as it is after a round trip through JSON."""
+    """Plain data with every field of every dataclass, as after a round trip through JSON."""
     if is_dataclass(value):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):

@@ -16,13 +16,13 @@ from zerobev.common.progress import progress
 warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
 
 
-def run_jobs(jobs: Iterable[Any], workers: int, what: str, total: int) -> Iterator[Any]:
+def run_jobs(jobs: Iterable[Any], workers: int, title: str, total: int) -> Iterator[Any]:
     """Results of `total` `joblib.delayed` calls, in order, computed in `workers` processes.
 
-    The back end of a surrounding `joblib.parallel_config` takes precedence. `what` names the progress bar.
+    The back end of a surrounding `joblib.parallel_config` takes precedence. `title` is that of the progress bar.
     """
     outcomes = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
-    yield from progress(outcomes, what, "scene", total)
+    yield from progress(outcomes, title, "scene", total)
 
 
 @contextlib.contextmanager

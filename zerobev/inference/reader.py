@@ -136,8 +136,8 @@ class _Opened:
     spread: int  #: factor of Pillow on the grey values of the file
 
 
-def _open(source: Source, what: str) -> _Opened:
-    name = str(source) if isinstance(source, str | Path) else what
+def _open(source: Source, kind: str) -> _Opened:
+    name = str(source) if isinstance(source, str | Path) else kind
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is checked below
@@ -182,7 +182,7 @@ def _file(source: str | Path | bytes | bytearray | memoryview | BinaryIO) -> Pat
     return Path(source) if isinstance(source, str | Path) else source
 
 
-_TOO_LARGE = f"expected at most {MAX_MEGAPIXELS} megapixels: scale photograph and masks down alike"
+_TOO_LARGE = f"expected at most {MAX_MEGAPIXELS} megapixels: scale photograph and masks down equally"
 
 
 def _check_size(image: Image.Image, name: str) -> None:

@@ -21,10 +21,10 @@ from zerobev.models.pyramid import FeaturePyramid
 class TwoStreamZeroBEV(BevModel):
     """Two streams with one attention (paper, Fig. 2e): geometry comes from the RGB image alone.
 
-    The RGB stream is a transformer. The zero-shot stream has the attention weights of its last cross-attention, and the
-    zero CNN's columns as values; the output projection merges the heads and maps them to the width of the map. The two
-    U-Nets share all weights; each stream has its own channels of the output. Attention does not depend on the zero-shot
-    images and is computed once for all of them.
+    The RGB stream is a transformer. The zero-shot stream uses the attention weights of the RGB stream's last
+    cross-attention, with the zero CNN's columns as values; an output projection merges the heads and gives the width of
+    the map. The two U-Nets share all weights, with separate output channels per stream. Attention does not depend on the
+    zero-shot images and is computed once for all of them.
 
     Raises `InputError` for a configuration without auxiliary maps: only these train the RGB stream's values.
     """

@@ -107,7 +107,7 @@ def test_only_single_images_are_read(read, tmp_path):
     refused(read, whole[: len(whole) // 2], "found a damaged one")
     refused(read, encoded(Image.new("RGB", (4, 4)), "EPS"), "found another kind of file")
     huge = encoded(Image.new("1", (20000, MAX_MEGAPIXELS * 50 + 1)))
-    refused(read, huge, f"expected at most {MAX_MEGAPIXELS} megapixels: scale photograph and masks down alike, found")
+    refused(read, huge, f"expected at most {MAX_MEGAPIXELS} megapixels: scale photograph and masks down equally, found")
     refused(read, encoded(Image.new("1", (20000, 20000))), "megapixels")
 
 
