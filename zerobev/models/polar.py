@@ -35,7 +35,7 @@ def band_rows(camera: CameraConfig, edges_m: tuple[float, ...]) -> list[range]:
 
 def image_column(camera: CameraConfig, rows: range) -> Tensor:
     """Image column u of each cell centre of map rows `rows`: (P, M) float64, pixels from the left edge."""
-    x, z = (torch.from_numpy(axis[rows]) for axis in bev_cell_centres(camera))
+    x, z = (torch.as_tensor(axis[rows]) for axis in bev_cell_centres(camera))
     return camera.fpv_px / 2 + camera.focal_px * x / z
 
 
@@ -45,7 +45,7 @@ def floor_row(camera: CameraConfig, rows: range, stride: int) -> Tensor:
     The camera is level, so the floor at depth z is at image row H / 2 + focal height / z in every column. Floor below
     the image counts as its last row.
     """
-    z = torch.from_numpy(bev_cell_centres(camera)[1][rows, 0])
+    z = torch.as_tensor(bev_cell_centres(camera)[1][rows, 0])
     v = camera.fpv_px / 2 + camera.focal_px * camera.height_m / z
     return (v / stride - 0.5).clamp(max=-(-camera.fpv_px // stride) - 1)
 

@@ -23,7 +23,7 @@ class TwoStreamZeroBEV(BevModel):
 
     The RGB stream is a transformer. The zero-shot stream uses the attention weights of the RGB stream's last
     cross-attention, with the zero CNN's columns as values; an output projection merges the heads and gives the width of
-    the map. The two U-Nets share all weights, with separate output channels per stream. Attention does not depend on the
+    the map. The two U-Nets share all weights and have separate output channels. Attention does not depend on the
     zero-shot images and is computed once for all of them.
 
     Raises `InputError` for a configuration without auxiliary maps: only these train the RGB stream's values.

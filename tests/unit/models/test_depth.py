@@ -425,7 +425,7 @@ def test_relative_depth_is_refused(tmp_path):
     with pytest.raises(InputError, match=re.escape(message)):
         HubDepth.from_pretrained(tmp_path)
     dpt().save_pretrained(tmp_path)
-    with pytest.raises(InputError, match="found a DPT, relative as published: say predicts_metres=True"):
+    with pytest.raises(InputError, match="found a DPT, relative as published: pass predicts_metres=True"):
         HubDepth.from_pretrained(tmp_path)
 
 
