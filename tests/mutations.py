@@ -134,7 +134,7 @@ MUTATIONS = (
     Mutation(
         "a whole batch for each rank",
         "zerobev/training/loader.py",
-        "self._source.batch(step, *self._place)",
+        "self._source.batch(step, self._rank, self._world_size)",
         "self._source.batch(step)",
         ("tests/unit/training/test_loader.py",),
     ),

@@ -1,13 +1,13 @@
 """Zero-BEV: zero-shot projection of any first-person modality to a bird's-eye-view map.
 
-`zerobev.load().project(rgb, modality)` is all that most uses need; see `zerobev.inference`.
+`zerobev.load().project(rgb, modality)` covers most uses; see `zerobev.inference`.
 """
 
 import os
 from typing import TYPE_CHECKING, Any
 
-# OpenMP reads this when torch is loaded. By default its threads spin while they wait for each other: beside two other
-# busy processes on two cores, that makes a training step more than ten times as slow.
+# OpenMP reads this when torch is loaded. By default its threads spin while they wait, which makes a training step more
+# than ten times as slow beside two other busy processes on two cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ __all__ = ["BevArrows", "BevMap", "Boxes", "Flow", "Labels", "Masks", "Probabili
 
 
 def __getattr__(name: str) -> Any:
-    # imported when first asked for: most commands of the package need no network
+    # imported on first use: most commands need no network
     if name in __all__:
         import zerobev.inference
 

@@ -1,7 +1,7 @@
-"""The command `zerobev`, also `python -m zerobev`: a subcommand per job, each in the module that does it.
+"""The command `zerobev`, also `python -m zerobev`: one subcommand per job, one module per subcommand.
 
-Such a module has a docstring that says what the command reads and writes, `add_arguments(parser)` and `run(options)`.
-It is imported only when its command is called.
+Such a module has `add_arguments(parser)` and `run(options)`; its docstring, the help text, states the command's inputs
+and outputs. It is imported only when its command is called.
 """
 
 import argparse
@@ -11,7 +11,7 @@ from typing import Any
 
 from zerobev.common.errors import run_command
 
-#: Command -> module, and its line of help.
+#: Command -> module and line of help.
 COMMANDS = {
     "project": ("zerobev.inference.project", "masks, labels or boxes of your image, on a map"),
     "evaluate": ("zerobev.evaluation.real_homes", "the shipped weights on a folder of homes"),
@@ -31,14 +31,14 @@ COMMANDS = {
 def main(arguments: list[str] | None = None) -> None:
     """Run a subcommand; bad input ends with one line on stderr and exit code 1.
 
-    arguments: of the command line; default: those of this process
+    arguments: of the command line; default: of this process
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     lines = "\n".join(f"  {name:<12}{text}" for name, (_, text) in COMMANDS.items())
     parser = argparse.ArgumentParser(
         prog="zerobev",
         description="Zero-shot projection of any first-person modality to a bird's-eye-view map.",
-        epilog=f"commands:\n{lines}\n\n`zerobev COMMAND --help` says what a command reads and writes.",
+        epilog=f"commands:\n{lines}\n\n`zerobev COMMAND --help` lists the inputs and outputs of a command.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND")

@@ -1,7 +1,7 @@
-"""Every number that can be set, as frozen dataclasses, and the three scales.
+"""All settings, as frozen dataclasses, and the three scales.
 
-A scale is one argument everywhere: code and notebooks are the same at all of them. What a scale does
-not name here (field of view, map extent, Dice loss, alpha, Adam, batch 16) is the paper's value.
+Code and notebooks are the same at every scale. Values that a scale does not set (field of view, map extent, alpha,
+batch of 16, ...) are the paper's.
 """
 
 import math
@@ -11,9 +11,9 @@ from typing import Any, Literal, get_args
 from zerobev.common.errors import InputError
 
 Split = Literal["train", "validation", "test"]
-#: Zero-shot stream of training; "classes" is not zero-shot (paper, Table 5 and Section 4).
+#: Training data of the zero-shot stream; "classes" is not zero-shot (paper, Table 5 and Section 4).
 Stream = Literal["synth", "modsem", "depthproj", "classes"]
-#: Depth that a method reads.
+#: Depth input of a method.
 Depth = Literal["true", "estimated"]
 #: Residual block of the RGB backbone.
 Block = Literal["basic", "bottleneck"]
@@ -22,14 +22,14 @@ SPLITS: tuple[Split, ...] = get_args(Split)
 
 #: The eight evaluated classes, in the column order of the paper's tables.
 LABELS = ("wall", "floor", "chair", "sofa", "bed", "plant", "toilet", "tv")
-#: Label value of everything that is none of the eight classes.
+#: Label of everything outside the eight classes.
 NO_LABEL = -1
 #: The auxiliary maps, in the order of their channels in a batch.
 AUX = ("obstacles", "navigable")
 
 
 def one_of(argument: str, value: Any, choices: Any) -> Any:
-    """`value`, if it is among `choices`, a `Literal` or a collection of names; else an `InputError` that lists them."""
+    """`value` if it is among `choices` (a `Literal` or a collection of names); else raises `InputError`."""
     names = get_args(choices) or tuple(choices)
     if value not in names:
         raise InputError(f"{argument}: expected one of {', '.join(names)}, found {value!r}")
@@ -45,18 +45,17 @@ def _require(name: str, value: float, holds: bool, expected: str) -> None:
 class CameraConfig:
     """The pinhole FPV camera and the orthographic BEV map in front of it (paper, supplement, "Cameras").
 
-    The FPV image is square, `fpv_px` wide; the map is `bev_px` x `bev_px` cells, row 0 farthest,
-    column 0 leftmost, the camera at the middle of its lower edge.
+    The map has row 0 farthest, column 0 leftmost, and the camera at the middle of its lower edge.
     """
 
-    fpv_px: int
-    bev_px: int
+    fpv_px: int  #: side of the square FPV image
+    bev_px: int  #: cells per side of the square map
     hfov_deg: float = 79.0
     height_m: float = 0.88  #: of the pinhole above the floor
-    bev_extent_m: float = 5.0  #: side of the square map
+    bev_extent_m: float = 5.0  #: side of the map
     bev_above_m: float = 2.0  #: height of the orthographic camera above the pinhole
-    max_height_m: float = 2.0  #: points above this height (over the floor) do not reach the map
-    obstacle_m: float = 0.10  #: a cell higher than this is an obstacle, else it is navigable
+    max_height_m: float = 2.0  #: above the floor; the map leaves out higher points
+    obstacle_m: float = 0.10  #: higher cells are obstacles, the others navigable
 
     def __post_init__(self) -> None:
         _require("fpv_px", self.fpv_px, self.fpv_px >= 1, "1 or more")
@@ -76,21 +75,21 @@ class CameraConfig:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """`extent` for `imshow` of a map: metres to the right of the camera, and in front of it."""
+        """`extent` for `imshow` of a map: metres to the right of the camera and in front of it."""
         half = self.bev_extent_m / 2
         return (-half, half, 0.0, self.bev_extent_m)
 
 
 @dataclass(frozen=True)
 class AgentConfig:
-    """The body that carries the camera, and which of its poses are worth a view (Habitat's ObjectNav agent)."""
+    """The body that carries the camera, and the choice of its poses (Habitat's ObjectNav agent)."""
 
     radius_m: float = 0.18
     height_m: float = 1.5
     climb_m: float = 0.2  #: geometry up to this height above the floor does not block
-    grid_m: float = 0.05  #: cell of the navigability grid
-    island_m2: float = 0.5  #: smaller patches of free floor (inside furniture, say) are not navigable
-    min_view: float = 0.10  #: share of the map that a view must see; poses that face a wall see less
+    grid_m: float = 0.05  #: side of a cell of the navigability grid
+    island_m2: float = 0.5  #: smaller patches of free floor (for example inside furniture) are not navigable
+    min_view: float = 0.10  #: minimum fraction of the map in view; poses that face a wall see less
 
 
 @dataclass(frozen=True)
@@ -102,15 +101,14 @@ class TextureConfig:
     kernel_px: tuple[int, int] = (10, 30)  #: smallest and largest kernel of opening and dilation
     tile_px: int = 1024  #: side of a tile of the texture bank
     tiles: int = 32  #: number of tiles in the bank
-    #: structures are this many times smaller (below 1: larger), drawn log-uniformly for each sample; equal ends are a
-    #: fixed scale, and 1 is the paper's
+    #: range of the factor by which structures shrink (below 1: grow), drawn log-uniformly per sample; the paper's is 1
     scales: tuple[float, float] = (1.0, 1.0)
     modsem_fraction: float = 0.30  #: of white texels in *Mod. Sem.* textures
 
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How many homes there are, how many views are taken in each, and the seed of both."""
+    """Number of scenes per split, number of views per scene, and the seed of both."""
 
     train: int
     validation: int
@@ -121,7 +119,7 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Widths of the network (paper, supplement, "Architecture Details"); near band first in `ffn`."""
+    """Sizes of the network (paper, supplement, "Architecture Details")."""
 
     width: int  #: channels of the pyramid, the transformers and the BEV features
     block: Block  #: residual block of the RGB backbone
@@ -130,21 +128,21 @@ class ModelConfig:
     stem_channels: int
     stem_stride: int  #: 2 or 4; stage b has stride stem_stride * 2**b
     zero_channels: tuple[int, int, int, int]  #: of the small CNN of the zero-shot stream
-    ffn: tuple[int, int, int, int]  #: hidden width of the feed-forward layers, a band
+    ffn: tuple[int, int, int, int]  #: hidden width of the feed-forward layers per band, near band first
     decoder_channels: tuple[int, int, int]  #: ResNet stages of the BEV decoder
     vpn_depths: tuple[int, int, int]  #: residual blocks, "basic", in each stage of VPN's smaller backbone
     vpn_channels: tuple[int, int, int]  #: output channels of these stages
     heads: int = 4
     layers: int = 2  #: of the column encoder, and of the ray decoder
     dropout: float = 0.1
-    ground_start: bool = False  #: rays begin by looking at the image row where the floor is seen (not in the paper)
-    zero_init_gain: float = 1.0  #: factor on the first weights of the zero-shot stream's CNN
-    residual_init_gain: float = 1.0  #: factor on the first weights of the residual's embedding
-    foreground_prior: float = 0.5  #: probability of white that maps start from
-    band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)
+    ground_start: bool = False  #: initial attention of rays is on the image row of the floor (not in the paper)
+    zero_init_gain: float = 1.0  #: factor on the initial weights of the zero-shot stream's CNN
+    residual_init_gain: float = 1.0  #: factor on the initial weights of the residual's embedding
+    foreground_prior: float = 0.5  #: initial probability of white in maps
+    band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)  #: depths between bands
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
-    segmentation: bool = False  #: the masks of the eight classes are an input (TIM, row (b.3))
+    segmentation: bool = False  #: masks of the eight classes as input (TIM, row (b.3))
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,7 @@ class TrainConfig:
 
     steps: int
     learning_rate: float
-    decay_every: int  #: steps between two multiplications of the learning rate with `decay`
+    decay_every: int  #: steps between two multiplications of the learning rate by `decay`
     validate_every: int  #: steps
     warmup: int = 0  #: steps of linear warm-up
     decay: float = 0.9
@@ -172,7 +170,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Scale:
-    """One consistent setting of everything."""
+    """A complete configuration."""
 
     name: str
     camera: CameraConfig
@@ -181,12 +179,10 @@ class Scale:
     train: TrainConfig
     depth: TrainConfig  #: of the depth estimator
     texture: TextureConfig = field(default_factory=TextureConfig)
-    #: fraction of the samples whose zero-shot image and map are made empty (not in the paper)
-    empty_fraction: float = 0.0
-    #: fraction of the *Synth* samples whose texture is extruded along the vertical (not in the paper)
-    extruded_fraction: float = 0.0
-    test_views: int | None = None  #: of each test scene, the first ones, that networks are evaluated on; None: all
-    #: first weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
+    empty_fraction: float = 0.0  #: fraction of empty samples (not in the paper)
+    extruded_fraction: float = 0.0  #: fraction of *Synth* samples with extruded textures (not in the paper)
+    test_views: int | None = None  #: networks are evaluated on the first so many of each test scene; None: all
+    #: initial weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
     backbone: str = ""
     vpn_backbone: str = ""
 
@@ -289,5 +285,5 @@ SCALES = {
 
 
 def scale(name: str) -> Scale:
-    """The scale called `name`; an unknown name is an `InputError` that lists the known ones."""
+    """The scale called `name`. Raises `InputError` for an unknown name."""
     return SCALES[one_of("scale", name, SCALES)]

@@ -496,8 +496,8 @@ def test_valid_arguments_of_project_are_accepted(projector: zerobev.Projector) -
     modalities += [zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]), zerobev.Flow([[1, 1]], [[1e300, 2]])]
     for image, modality in zip(images * 2, modalities):
         projector.project(image, modality, np.float32(66))
-    wide = next(iter(zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]).images((8, 8)).images))
-    assert wide[:4].all() and not wide[4:].any()  # a box that ends far outside covers all pixels up to the border
+    (wide,) = zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]).layers((8, 8))[0].images
+    assert wide[:4].all() and not wide[4:].any()  # a box that ends far outside covers all up to the border
 
 
 def test_too_many_images_are_refused(projector: zerobev.Projector) -> None:

@@ -9,17 +9,22 @@ T = TypeVar("T")
 
 
 class InputError(ValueError):
-    """Bad input from the user: the message names the file or argument, what was expected and what was found."""
+    """Bad input from the user: the message is "NAME: expected X, found Y", with a file or an argument as NAME."""
 
 
 class SetupError(InputError):
-    """The machine lacks something that every input needs, so that the next input would fail as well."""
+    """The machine lacks something that every input needs: the next input would fail as well."""
+
+
+def first_line(error: Exception) -> str:
+    """First line of the message of an error; its type if it has no message."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def attempt(work: Callable[[], T]) -> T | InputError:
-    """The result of `work` on one input of many, or its failure, whatever it is, as an `InputError` of one line.
+    """The result of `work` on one input of many, or any failure as an `InputError` of one line.
 
-    Raised are only errors that every other input would meet, `SetupError` and a full disk, and what is no
+    Errors that every other input would meet are raised: `SetupError` and a full disk. So is anything other than an
     `Exception`, such as `KeyboardInterrupt`.
     """
     try:
@@ -28,17 +33,14 @@ def attempt(work: Callable[[], T]) -> T | InputError:
         raise
     except InputError as error:
         return InputError(str(error))  # without the traceback, which would keep the input in memory
-    except Exception as error:
+    except Exception as error:  # one faulty input, whatever its error, does not end the work on the others
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             raise
         return InputError(" ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":"))
 
 
 def run_command(main: Callable[[], None]) -> None:
-    """Run a command's `main`; an `InputError` becomes one line on stderr and exit code 1, without a traceback.
-
-    So does a full disk.
-    """
+    """Run a command's `main`; `InputError` and a full disk become one line on stderr and exit code 1, no traceback."""
     try:
         main()
     except InputError as error:

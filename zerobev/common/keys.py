@@ -1,4 +1,4 @@
-"""Keys: equal configurations have equal names, and a new config field with a default changes no name."""
+"""Keys: equal configurations have equal keys, and a new config field with a default changes no key."""
 
 import hashlib
 import json
@@ -13,21 +13,20 @@ def fingerprint(config: Any) -> str:
 
 
 def changed(value: Any) -> Any:
-    """Plain data without dataclass fields that have their default, and without dataclasses that have nothing else.
+    """Plain data without dataclass fields equal to their defaults, and without dataclasses that are then empty.
 
-    A field without a default stays. Raises `TypeError` for values that are no plain data.
+    A field without a default stays. Raises `TypeError` for values other than plain data.
     """
     if is_dataclass(value):
         own = {f.name: getattr(value, f.name) for f in fields(value) if getattr(value, f.name) != _default(f)}
         return changed(own)
     if isinstance(value, Mapping):
-        parts = {name: (part, changed(part)) for name, part in value.items()}
-        return {name: kept for name, (part, kept) in parts.items() if kept != {} or not is_dataclass(part)}
+        return {name: changed(part) for name, part in value.items() if not _all_default(part)}
     return _plain_leaf(value, changed)
 
 
 def plain(value: Any) -> Any:
-    """Plain data with every field of every dataclass, as JSON gives it back."""
+    """Plain data with every field of every dataclass, as after a round trip through JSON."""
     if is_dataclass(value):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
@@ -36,7 +35,7 @@ def plain(value: Any) -> Any:
 
 
 def matches(stored: Any, value: Any) -> bool:
-    """Whether plain data `stored` are those of `value`, up to fields that are newer and have their default."""
+    """Whether `stored` equals `plain(value)`; fields missing from `stored` must have their default in `value`."""
     if is_dataclass(value):
         parts = {f.name: (getattr(value, f.name), _default(f)) for f in fields(value)}
     elif isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Jobs over scenes, spread over processes or a cluster by joblib, with progress."""
+"""Jobs over scenes in several processes or on a cluster, with progress."""
 
 import contextlib
 import warnings
@@ -11,36 +11,36 @@ import joblib
 from zerobev.common.errors import InputError
 from zerobev.common.progress import progress
 
-# After large homes joblib takes a worker's memory for a leak and replaces it between two jobs: nothing is lost, and
-# nothing to be told. A worker that dies is another matter, an exception.
+# joblib suspects a leak after large homes and replaces the worker between two jobs; no result is lost. A worker that
+# dies still raises an exception.
 warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
 
 
-def run_jobs(jobs: Iterable[Any], workers: int, what: str, total: int) -> Iterator[Any]:
-    """Results of `total` `joblib.delayed` calls, in their order, in `workers` processes.
+def run_jobs(jobs: Iterable[Any], workers: int, title: str, total: int) -> Iterator[Any]:
+    """Results of `total` `joblib.delayed` calls, in order, computed in `workers` processes.
 
-    Under `joblib.parallel_config` with another back end, that one decides. `what` names the progress bar.
+    The back end of a surrounding `joblib.parallel_config` takes precedence. `title` is that of the progress bar.
     """
     outcomes = joblib.Parallel(n_jobs=workers, return_as="generator")(jobs)
-    yield from progress(outcomes, what, "scene", total)
+    yield from progress(outcomes, title, "scene", total)
 
 
 @contextlib.contextmanager
 def cluster(address: str | None) -> Iterator[None]:
-    """Let `run_jobs` work on the dask cluster with the scheduler at `address`, if there is one.
+    """Run `run_jobs` on the dask cluster of the scheduler at `address`; None: in local processes.
 
-    The job of a worker that dies is done by another; where it ends as many workers as the scheduler allows, it is taken
-    for the cause, and `run_jobs` raises dask's `KilledWorker`. Raises `InputError` where there is no scheduler.
+    If a worker dies, another repeats its job. If a job kills as many workers as the scheduler allows, `run_jobs` raises
+    dask's `KilledWorker`. Raises `InputError` if no scheduler answers.
     """
     if address is None:
         yield
         return
-    # not needed, and slow to import, without a cluster
+    # slow to import, and needed only with a cluster
     from dask.distributed import Client
     from joblib._dask import DaskDistributedBackend
 
     class Backend(DaskDistributedBackend):
-        """joblib's own, which does not hear of a job that dask gives up, and waits for it for ever."""
+        """joblib's back end; on its own it waits forever for a job that dask gives up."""
 
         def submit(self, func: Any, callback: Callable[[Any], None]) -> Future:
             job = super().submit(func, callback)

@@ -1,4 +1,4 @@
-"""Progress of long work: on a terminal, or into the file that `ZEROBEV_PROGRESS` names; never in a notebook."""
+"""Progress of long work: on a terminal, or in the file named by `ZEROBEV_PROGRESS`; never in a notebook."""
 
 import os
 import sys
@@ -11,11 +11,11 @@ from tqdm import tqdm
 T = TypeVar("T")
 
 
-def progress(items: Iterable[T], what: str, unit: str, total: int, done: int = 0) -> Iterator[T]:
-    """Yield `items`, showing how many of `total` are done (`done` of them before) and when the rest will be."""
+def progress(items: Iterable[T], title: str, unit: str, total: int, done: int = 0) -> Iterator[T]:
+    """Yield `items` and show the number done out of `total` and the remaining time; `done` were done before."""
     log = os.environ.get("ZEROBEV_PROGRESS")
     if log:
         with Path(log).open("a") as file:
-            yield from tqdm(items, what, total, initial=done, unit=unit, file=file, mininterval=2, ncols=80)
+            yield from tqdm(items, title, total, initial=done, unit=unit, file=file, mininterval=2, ncols=80)
     else:
-        yield from tqdm(items, what, total, initial=done, unit=unit, disable=not sys.stderr.isatty())
+        yield from tqdm(items, title, total, initial=done, unit=unit, disable=not sys.stderr.isatty())

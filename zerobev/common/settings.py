@@ -1,4 +1,4 @@
-"""Settings: values of a frozen configuration, changed by text such as `train.steps=2400`."""
+"""Settings: text such as `train.steps=2400` that changes values of a frozen configuration."""
 
 import ast
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ T = TypeVar("T")
 
 
 def changed_by(config: T, settings: Sequence[str]) -> T:
-    """A dataclass with some values changed; those of dataclasses in it are named by a path.
+    """A dataclass with some values changed; a path names a value of a nested dataclass.
 
-    settings: `path=value`, value as Python writes it; quotes around text may be left out
-    Raises `InputError` for an unknown path and for a value of another type.
+    settings: `path=value`, with a Python literal as value; quotes around text may be omitted
+    Raises `InputError` for an unknown path and for a value of the wrong type.
     """
     for setting in settings:
         path, equals, text = setting.partition("=")
@@ -39,12 +39,12 @@ def _changed(config: Any, path: list[str], text: str, setting: str) -> Any:
         return replace(config, **{name: _changed(value, rest, text, setting)})
     try:
         return replace(config, **{name: _parsed(text, get_type_hints(type(config))[name])})
-    except ValueError as error:  # of another type, or refused by the dataclass
+    except ValueError as error:  # wrong type, or refused by the dataclass
         raise InputError(f"setting {setting!r}: {error}") from None
 
 
 def _parsed(text: str, kind: Any) -> Any:
-    """The value of `text`; a `ValueError` if it is not of type `kind`."""
+    """The value of `text`; raises `ValueError` if it is not of type `kind`."""
     try:
         value = ast.literal_eval(text)
     except (ValueError, SyntaxError):

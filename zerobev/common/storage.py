@@ -1,4 +1,4 @@
-"""Whole files or none: every file is written under a temporary name and renamed when it is complete."""
+"""Atomic writes: every file is written under a temporary name and renamed when it is complete."""
 
 import json
 import os
@@ -10,10 +10,10 @@ from typing import Any
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`; on success rename it to `path`, on any error remove it.
+    """Yield a temporary path beside `path`; on success rename it to `path`, on any error remove it.
 
-    The parent folder is made. The temporary name keeps the suffix and carries the process id, so that
-    two processes that write the same file do not meet: the later rename wins, whole.
+    The parent folder is created. The temporary name keeps the suffix and contains the process id, so two processes can
+    write the same file: the later rename wins.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -26,7 +26,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, value: dict[str, Any] | list[Any]) -> None:
-    """Write `value` as JSON, one line an entry, so that a change in a committed file is a line in a diff."""
+    """Write `value` as JSON, one line per entry, so that a diff of a committed file shows each changed entry."""
     if isinstance(value, dict):
         lines = [f"{json.dumps(key)}: {json.dumps(entry, sort_keys=True)}" for key, entry in sorted(value.items())]
         text = "{\n" + ",\n".join(lines) + "\n}\n"

@@ -17,7 +17,7 @@ from zerobev.common.progress import progress
 from zerobev.config import AgentConfig, CameraConfig
 from zerobev.geometry.projection import map_points
 from zerobev.inference.bev_map import BevArrows
-from zerobev.inference.flow import Flow, flow_field
+from zerobev.inference.flow import MIN_PX, Flow, flow_field
 from zerobev.inference.projector import GEOMETRIC, Projector, load
 from zerobev.inference.shipped_weights import ROWS
 from zerobev.rendering.gbuffer import RayCaster
@@ -32,7 +32,6 @@ PHOTOGRAPH_PX = 256
 _SHIFT_M = (0.2, 0.6)  # range of an object's motion
 _AREA = (0.01, 0.4)  # range of an object's area, as a fraction of the photograph
 _SPACING_PX = 16  # of vectors
-_MIN_PX = 1.0  # length of a vector
 _TRIES = 100
 
 
@@ -99,9 +98,9 @@ def arrow_errors(projector: Projector, pair: MovingPair, field: np.ndarray) -> p
     """
     on_object = np.where(pair.on_object[..., None], field, 0).astype(np.float64)
     grid = slice(_SPACING_PX // 2, None, _SPACING_PX)  # of `Flow.of`
-    if np.linalg.norm(on_object[grid, grid], axis=-1).max() < _MIN_PX:
+    if np.linalg.norm(on_object[grid, grid], axis=-1).max() < MIN_PX:
         return None
-    flow = Flow.of(on_object, pair.second, _MIN_PX, _SPACING_PX)
+    flow = Flow.of(on_object, pair.second, _SPACING_PX)
     arrows = projector.project(pair.first, flow)
     assert isinstance(arrows, BevArrows)  # as of every flow
     column, row = np.floor(flow.start_px).astype(int).T

@@ -71,7 +71,7 @@ class DepthPretraining:
 
     def recorded(self) -> Record | None:
         """Its record; None if the record or the weights are missing."""
-        return find(self.path, Record, self.key, self.config) if self._weights.exists() else None
+        return find(self.path, self.key, self.config) if self._weights.exists() else None
 
     @cached_property
     def record(self) -> Record:

@@ -61,26 +61,28 @@ def key_of(name: str, config: Mapping[str, Any]) -> str:
     return f"{name}-{fingerprint(config)}"
 
 
-def find(path: Path, kind: type[R], key: str, config: Mapping[str, Any] | None = None) -> R | None:
-    """The record in `path`; None if it has to be made.
+def read(path: Path, kind: type[R]) -> R | None:
+    """The record in `path`; None if it is missing or, with `make reproduce FRESH=1`, older than that call.
 
-    It has to be made if it is missing, has another key, or stores another value for a field that has its default today.
-    With `make reproduce FRESH=1` it also has to be made if it is older than that call.
-
-    config: today's configuration; None: only the key is compared
     Raises `InputError` for a file that is no such record.
     """
     fresh_since = float(os.environ.get("ZEROBEV_FRESH", 0))
     if not path.exists() or path.stat().st_mtime < fresh_since:
         return None
     try:
-        record = kind.from_json(json.loads(path.read_text()))
+        return kind.from_json(json.loads(path.read_text()))
     except NO_RECORD as error:
         found = f"{type(error).__name__}: {error}" if not isinstance(error, InputError) else error
         raise InputError(f"{path}: expected a record, found {found}") from None
-    if record.key != key or (config is not None and not matches(record.config, config)):
-        return None
-    return record
+
+
+def find(path: Path, key: str, config: Mapping[str, Any]) -> Record | None:
+    """The record in `path` of today's configuration; None if it has to be made.
+
+    It has to be made if it is missing, has another key, or stores another value for a field that has its default today.
+    """
+    record = read(path, Record)
+    return record if record and record.key == key and matches(record.config, config) else None
 
 
 def write(path: Path, record: Record) -> None:
@@ -100,7 +102,7 @@ def recorded(
     Raises `InputError` for a file that is no record.
     """
     key = key_of(name, config)
-    if (record := find(path, Record, key, config)) is None:
+    if (record := find(path, key, config)) is None:
         revision, started = git_revision(), time.monotonic()
         result = compute()
         cost = {"seconds": round(time.monotonic() - started, 1)}

@@ -1,5 +1,6 @@
 """Records of runs: intersections and unions per test scene, and the maps predicted for the gallery."""
 
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -7,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from zerobev.common.errors import InputError
+from zerobev.common.keys import matches
 from zerobev.common.storage import replacing
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.records import Record, find, write
+from zerobev.experiments.records import Record, read, write
 
 
 class RunRecord(Record):
@@ -60,9 +62,19 @@ class RunStore:
         """The file of a run's record."""
         return self._records / f"{key}.json"
 
-    def find(self, key: str, config: dict[str, Any] | None = None) -> RunRecord | None:
-        """The record of a run; None if it has to be made, see `records.find`."""
-        return find(self.path(key), RunRecord, key, config)
+    def find(self, key: str, config: Mapping[str, Any] | None = None) -> RunRecord | None:
+        """The record of a run; None if it has to be made.
+
+        config: today's configuration; a record with another value for a field that has its default today is not found
+        Raises `InputError` for a file that is no record of this run.
+        """
+        path = self.path(key)
+        record = read(path, RunRecord)
+        if record is not None and record.key != key:
+            raise InputError(f"{path}: expected a record of {key}, found one of {record.key}")
+        if record is None or (config is not None and not matches(record.config, config)):
+            return None
+        return record
 
     def write(self, record: RunRecord, maps: np.ndarray) -> None:
         """Write a record and its maps of the gallery's views, (views, classes, M, M) bool."""

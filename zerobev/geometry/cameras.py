@@ -1,8 +1,8 @@
-"""The two cameras: pinhole FPV and orthographic BEV, and the frames between them.
+"""The two cameras, pinhole FPV and orthographic BEV, and their frames.
 
-Frames. World: metres, z up. Camera: x right, y down, z forward, origin at the pinhole. Map: x right of
-the camera, y forward, z up, origin on the floor below the pinhole. The camera is level, so map and
-camera frame differ by a fixed rotation and the camera's height alone.
+Frames, metres. World: z up. Camera: x right, y down, z forward, origin at the pinhole. Map: x right of the camera,
+y forward, z up, origin on the floor below the pinhole. The camera is level, so map and camera frame differ only by a
+fixed rotation and the camera's height.
 """
 
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from zerobev.config import CameraConfig
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the camera stands: a point of the floor (metres, world) and its heading.
+    """Position of the camera on the floor (world frame, metres), and its heading.
 
-    `yaw` is the angle of the forward direction from world +x, counter-clockwise, radians.
+    yaw: angle of the forward direction from world +x, counter-clockwise, radians
     """
 
     x: float
@@ -44,7 +44,7 @@ class Pose:
 def fpv_rays(camera: CameraConfig) -> np.ndarray:
     """(H, W, 3) float64: ray of each pixel centre in the camera frame, scaled to z = 1.
 
-    With that scale the ray parameter of a hit is its planar depth.
+    The ray parameter of a hit is therefore its planar depth.
     """
     u = (np.arange(camera.fpv_px) + 0.5 - camera.fpv_px / 2) / camera.focal_px
     x, y = np.meshgrid(u, u)

@@ -1,6 +1,6 @@
 """P^-1: projection to the map with known depth, and the field of view on the map (paper, Sections 3 and 8).
 
-Written in torch, since the residual model uses it inside the network; images come in batches.
+Written in torch, since the residual model applies it to batches inside the network.
 """
 
 from functools import cache
@@ -15,12 +15,12 @@ from zerobev.geometry.cameras import fpv_rays
 
 @cache
 def _slopes(camera: CameraConfig) -> np.ndarray:
-    """(H,) float64: how far to the right a column looks, and a row down, at depth 1."""
+    """(H,) float64: at depth 1, the offset of each column to the right and of each row downwards."""
     return fpv_rays(camera)[0, :, 0]
 
 
 def map_coordinates(depth: torch.Tensor, camera: CameraConfig) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The coordinates of `map_points`, a tensor (..., H, W) each: x to the right, y forward, z above the floor, metres.
+    """x to the right, y forward, z above the floor of the points seen by each pixel: (..., H, W) each, metres.
 
     depth: (..., H, W) planar depth, metres, of square images
     """
@@ -29,18 +29,15 @@ def map_coordinates(depth: torch.Tensor, camera: CameraConfig) -> tuple[torch.Te
 
 
 def map_points(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
-    """Points seen by the pixels of `depth` in the map frame (x right, y forward, z above the floor).
-
-    depth: (..., H, W) planar depth, metres. Returns (..., H, W, 3) of the same dtype, metres.
-    """
+    """`map_coordinates` in one tensor: points in the map frame, (..., H, W, 3) of the dtype of `depth`, metres."""
     return torch.stack(map_coordinates(depth, camera), dim=-1)
 
 
 def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
-    """Index row * M + column of the map cell that each pixel falls into; M * M where it falls into none.
+    """Index row * M + column of the map cell of each pixel; M * M for "no cell".
 
-    depth: (..., H, W) planar depth, metres, 0 for nothing seen. Points above `max_height_m` reach no cell.
-    Returns (..., H, W) int64.
+    depth: (..., H, W) planar depth, metres; 0: nothing seen
+    Points at or above `max_height_m` have no cell. Returns (..., H, W) int64.
     """
     x, y, z = map_coordinates(depth, camera)
     side = camera.bev_px
@@ -52,20 +49,19 @@ def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
 
 
 def inverse_project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
-    """P^-1 with max-pooling to the ground: a cell holds the largest value among the pixels that fall into it.
+    """P^-1 with max-pooling to the ground: the value of a cell is the maximum over its pixels; 0 without a pixel.
 
-    Counting points in voxels, leaving out those above 2 m, summing over height and thresholding at zero
-    (supplement, "residual variant") marks exactly the cells that some white pixel falls into, whatever the
-    height of a voxel; the maximum over pixels is that, and serves values in [0, 1] as well.
+    The paper counts points in voxels, drops those above 2 m, sums over height and thresholds at zero (supplement,
+    "residual variant"). This marks the cells of white pixels, for every voxel height. The maximum over pixels gives the
+    same cells, and also works for values in [0, 1].
 
-    The paper's voxels are 100 x 100 x 100, so a column of them is a cell of its map of 100 x 100. With a smaller map,
-    of 40 x 40 or 20 x 20 cells, columns may be cut finer than cells; it makes no difference where a cell is made of
-    whole columns (20 does: 5 x 5 columns a cell), since a cell then holds a white point if and only if one of its
-    columns does. 40 does not divide 100: a column of 5 cm that straddles the edge of two cells of 12.5 cm would have to
-    be given to one of them, and would move a point by up to 2.5 cm for nothing. Points are therefore put into cells
-    directly, at every size.
+    The paper's 100 x 100 x 100 voxels match its map of 100 x 100 cells. At every map size, points are assigned to cells
+    directly. For 20 x 20 cells of 5 x 5 voxel columns each, the voxels would give the same map. For 40 x 40 cells of
+    12.5 cm, columns of 5 cm would straddle cell edges and displace points by up to 2.5 cm.
 
-    zero: (B, K, H, W) values >= 0; depth: (B, 1, H, W) metres. Returns (B, K, M, M), 0 where no pixel falls.
+    zero: (B, K, H, W) values >= 0
+    depth: (B, 1, H, W) metres
+    Returns (B, K, M, M).
     """
     batch, modalities = zero.shape[:2]
     side = camera.bev_px
@@ -76,9 +72,11 @@ def inverse_project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfi
 
 
 def inverse_project_mask(mask: np.ndarray, depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
-    """`inverse_project` of one binary image, several times faster: the cells that a white pixel falls into.
+    """`inverse_project` of one binary image, several times faster.
 
-    mask: (H, W) bool; depth: (H, W) float, metres. Returns (M, M) bool.
+    mask: (H, W) bool
+    depth: (H, W) float, metres
+    Returns (M, M) bool: the cells of white pixels.
     """
     hit = np.zeros(camera.bev_px**2 + 1, bool)
     hit[cells_of_pixels(torch.from_numpy(depth), camera).numpy()[mask]] = True
@@ -86,17 +84,17 @@ def inverse_project_mask(mask: np.ndarray, depth: np.ndarray, camera: CameraConf
 
 
 def fov_mask(depth: np.ndarray, camera: CameraConfig) -> np.ndarray:
-    """(M, M) bool: cells with their centre in the convex hull of all cells that the depth image reaches.
+    """(M, M) bool: cells with their centre in the convex hull of the corners of all cells with a pixel.
 
-    depth: (H, W) float, metres. The mask is empty where no pixel reaches the map; one cell reached is one
-    cell in the mask, since the hull is that of the cells' corners.
+    depth: (H, W) float, metres
+    The mask is empty if no pixel has a cell.
     """
     side = camera.bev_px
     on_map = inverse_project_mask(np.ones_like(depth, bool), depth, camera)
     row = np.flatnonzero(on_map.any(axis=1))
     if not len(row):
         return np.zeros((side, side), bool)
-    # the hull is that of the first and the last cell of each row
+    # the first and the last cell of each row have the same hull as all cells
     ends = on_map[row].argmax(axis=1), side - on_map[row, ::-1].argmax(axis=1)
     corners = np.concatenate([np.stack([column, row + dy], axis=1) for column in ends for dy in (0, 1)])
     planes = ConvexHull(corners).equations  # (edges, 3): a x + b y + c <= 0 inside

@@ -1,4 +1,4 @@
-"""Projection of anything known in a photograph: masks, labels, probabilities, boxes, flow."""
+"""Projection of any modality of a photograph: masks, labels, probabilities, boxes, flow."""
 
 from zerobev.inference.bev_map import BevArrows, BevMap
 from zerobev.inference.boxes import Boxes

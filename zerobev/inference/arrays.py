@@ -1,4 +1,4 @@
-"""Arrays as people have them -> checked NumPy arrays: photographs, and stacks with channels first or last."""
+"""Arrays in common formats -> checked NumPy arrays: photographs, and stacks with channels first or last."""
 
 from typing import Any, Literal
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from zerobev.common.errors import InputError
 from zerobev.inference.reader import MAX_MEGAPIXELS, is_source, read_image
 
-#: Where a stack of K images has its K: (K, H, W) or (H, W, K); None: where the photograph's size says.
+#: Axis of the K images in a stack: (K, H, W) or (H, W, K); None: by the photograph's size.
 Channels = Literal["first", "last"] | None
 
 
@@ -25,10 +25,10 @@ def checked_image(rgb: Any) -> np.ndarray:
         if array.ndim == 3 and array.shape[0] == 3:
             hint = ": move the channels last"
         elif array.ndim == 3 and array.shape[-1] == 4:
-            hint = ": take alpha away"
+            hint = ": remove alpha"
         raise InputError(f"rgb: expected (H, W, 3), found {array.shape}{hint}")
     if array.shape[0] * array.shape[1] > MAX_MEGAPIXELS * 1_000_000:
-        found = f"{array.shape[0] * array.shape[1] / 1e6:.0f}: scale photograph and modality down alike"
+        found = f"{array.shape[0] * array.shape[1] / 1e6:.0f}: scale photograph and modality down equally"
         raise InputError(f"rgb: expected at most {MAX_MEGAPIXELS} megapixels, found {found}")
     if array.dtype == np.uint8:
         return array.astype(np.float32) / 255
@@ -42,12 +42,12 @@ def checked_image(rgb: Any) -> np.ndarray:
 
 
 def as_array(value: Any, name: str) -> np.ndarray:
-    """A NumPy array of an array, a torch tensor on any device, or nested lists of numbers.
+    """A NumPy array from an array, a torch tensor on any device, or nested lists of numbers.
 
-    Raises `InputError` for anything else, image files among it, and for masked arrays with masked values.
+    Raises `InputError` for anything else, including image files, and for masked arrays with masked values.
     """
     if is_source(value) or (isinstance(value, list | tuple) and any(map(is_source, value))):
-        raise InputError(f"{name}: expected an array, found an image file: say Masks.read(...) or Labels.read(...)")
+        raise InputError(f"{name}: expected an array, found an image file: use Masks.read(...) or Labels.read(...)")
     if np.ma.is_masked(value):
         raise InputError(f"{name}: expected an array, found one with masked values: fill them")
     try:
@@ -55,7 +55,7 @@ def as_array(value: Any, name: str) -> np.ndarray:
             return np.stack([_of_tensor(entry) for entry in value])
         return _of_tensor(value)
     except (ValueError, TypeError, RuntimeError, OverflowError):
-        raise InputError(f"{name}: expected an array, found {type(value).__name__} that is none") from None
+        raise InputError(f"{name}: expected an array, found {type(value).__name__} that cannot be converted") from None
 
 
 def _of_tensor(value: Any) -> np.ndarray:
@@ -69,7 +69,7 @@ def stacked(array: np.ndarray, shape: tuple[int, int], channels: Channels, name:
     """(H, W), (K, H, W) or (H, W, K) -> (K, H, W).
 
     shape: (H, W) of the photograph
-    Raises `InputError` for another shape, and where `channels` is None and both readings fit.
+    Raises `InputError` for another shape, and if `channels` is None and both orders fit.
     """
     height, width = shape
     if array.size and array.shape == (height, width):
@@ -77,7 +77,7 @@ def stacked(array: np.ndarray, shape: tuple[int, int], channels: Channels, name:
     first = array.ndim == 3 and array.shape[1:] == (height, width)
     last = array.ndim == 3 and array.shape[:2] == (height, width)
     if first and last and channels is None and len(array) > 1:
-        found = f"{array.shape}: say channels='first' or channels='last', as in {name}(array, channels='first')"
+        found = f"{array.shape}: pass channels='first' or channels='last', as in {name}(array, channels='first')"
         raise InputError(f"modality: expected channels first or last, found both in {found}")
     if array.size and ((first and channels != "last") or (last and channels != "first")):
         return array if first and channels != "last" else np.moveaxis(array, -1, 0)
@@ -85,7 +85,7 @@ def stacked(array: np.ndarray, shape: tuple[int, int], channels: Channels, name:
     expected = f"({height}, {width}, K)" if channels == "last" else expected
     hint = ""
     if array.ndim in (2, 3) and array.shape[-2:] == (width, height):
-        hint = ": rows and columns are swapped, or the photograph was turned by its EXIF orientation and this was not"
+        hint = ": rows and columns are swapped, or only the photograph was turned by its EXIF orientation"
     elif array.ndim == 2 and array.size and abs(array.shape[1] * height - array.shape[0] * width) < sum(array.shape):
         hint = ": resize it to the photograph, by nearest neighbour"
     raise InputError(f"modality: expected {expected} of {array.dtype}, found {array.shape}{hint}")

@@ -1,4 +1,4 @@
-"""What comes back from a projection: maps, and arrows between maps, with metres attached."""
+"""Results of a projection: maps, and arrows between maps, in metres."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from zerobev.common.storage import replacing
 from zerobev.config import CameraConfig
 
 _FLOOR, _OUTSIDE = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
-_LONGEST_LEGEND = 12
+_MAX_LEGEND = 12
 _COLORS = [color for name in ("tab10", "Set2", "Set1") for color in matplotlib.color_sequences[name]]
 
 
@@ -24,17 +24,16 @@ _COLORS = [color for name in ("tab10", "Set2", "Set1") for color in matplotlib.c
 class BevMap:
     """K maps of M x M cells: row 0 farthest, column 0 leftmost, the camera at the middle of the lower edge."""
 
-    values: np.ndarray  #: (K, M, M) float32 in [0, 1]: probability that a cell is white, or the projected real value
+    values: np.ndarray  #: (K, M, M) float32 in [0, 1]: probability of white, or the projected real value
     labels: tuple[str, ...]  #: K names
-    #: (K, M, M) float32 >= 0: what the modality adds to a map, as the rise of the logit over that of an empty image
-    evidence: np.ndarray
-    fov: np.ndarray  #: (M, M) bool: cells in the field of view, by estimated depth
+    evidence: np.ndarray  #: (K, M, M) float32 >= 0: rise of the logit over that of an empty image; of P^-1: the values
+    fov: np.ndarray  #: (M, M) bool: cells in the field of view, from estimated depth
     camera: CameraConfig
     scores: np.ndarray | None = None  #: (K,) float64, of detections
 
     @property
     def maps(self) -> np.ndarray:
-        """(K, M, M) bool: cells in the field of view with a value above one half."""
+        """(K, M, M) bool: cells in the field of view with a value above 1/2."""
         return (self.values > 0.5) & self.fov
 
     @property
@@ -44,15 +43,15 @@ class BevMap:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """`extent` for `imshow`: metres to the right of the camera, and in front of it."""
+        """`extent` for `imshow`: metres to the right of the camera and in front of it."""
         return self.camera.extent
 
     @property
     def centres_m(self) -> np.ndarray:
-        """(K, 2) float64: where each modality is, metres right and forward; NaN where nothing speaks for any cell.
+        """(K, 2) float64: position of each modality, metres right and forward; NaN where all evidence is zero.
 
-        It is the centre of gravity of the evidence of cells that have half of the most, or more. That finds what is too
-        small for a probability above one half anywhere.
+        This is the centre of gravity of the evidence over cells with at least half of its maximum; no probability needs
+        to be above 1/2, which small objects may not reach.
         """
         row, column = np.indices(self.fov.shape) + 0.5
         right, forward = column * self.cell_m + self.extent[0], self.extent[3] - row * self.cell_m
@@ -63,14 +62,14 @@ class BevMap:
         return np.divide(sums, total, out=np.full(sums.shape, np.nan), where=total > 0)
 
     def footprints(self) -> pd.DataFrame:
-        """One line a map: label, score if there is one, area of `maps` in square metres, and centre in metres."""
+        """One row per map: label, score if there is one, area of `maps` in square metres, and centre in metres."""
         score = {} if self.scores is None else {"score": self.scores}
         right, forward = self.centres_m.T
         area = self.maps.sum(axis=(1, 2)) * self.cell_m**2
         return pd.DataFrame({"label": self.labels, **score, "area_m2": area, "right_m": right, "forward_m": forward})
 
     def image(self) -> np.ndarray:
-        """(M, M, 3) float64: each map in a colour of its own, larger ones below smaller ones."""
+        """(M, M, 3) float64: each map in another colour, larger maps below smaller ones."""
         image = np.where(self.fov[..., None], _FLOOR, _OUTSIDE)
         for k in np.argsort(-self.maps.sum(axis=(1, 2)), kind="stable").tolist():
             opacity = (self.values[k] * self.fov * (self.values[k] > 0.1))[..., None]
@@ -78,9 +77,9 @@ class BevMap:
         return image
 
     def show(self, axes: Axes | None = None) -> Axes:
-        """Draw the maps with metres on both axes, and a legend of those that are not empty.
+        """Draw the maps with metres on both axes, and a legend of the maps that are not empty.
 
-        Detections are all shown: a cross marks the centre of those with an empty map.
+        All detections are shown: a cross marks the centre of a detection with an empty map.
         """
         axes = axes or plt.gca()
         axes.imshow(self.image(), extent=self.extent, interpolation="nearest")
@@ -91,7 +90,7 @@ class BevMap:
                 axes.plot(*self.centres_m[k], "x", color=color_of(k))
             found |= np.isfinite(self.centres_m).all(axis=1)
         shown = np.flatnonzero(found).tolist()
-        if 0 < len(shown) <= _LONGEST_LEGEND:
+        if 0 < len(shown) <= _MAX_LEGEND:
             patches = [Patch(color=color_of(k), label=self._title(k)) for k in shown]
             axes.legend(handles=patches, fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
         return axes
@@ -100,7 +99,7 @@ class BevMap:
         """Write one NPZ file: values, maps, fov, labels, extent (metres), cell_m, and scores if there are any.
 
         path: ends in `.npz`, which is added to a name without a suffix
-        Raises `InputError` for another suffix, and where no file can be written.
+        Raises `InputError` for another suffix, and if the file cannot be written.
         """
         path = Path(path)
         if path.suffix.lower() not in ("", ".npz") or not path.name:
@@ -117,7 +116,7 @@ class BevMap:
                     labels=np.array(self.labels),
                     extent=self.extent,
                     cell_m=self.cell_m,
-                    **scores,  # type: ignore[arg-type]  # NumPy's stub takes all for `allow_pickle`
+                    **scores,  # type: ignore[arg-type]  # NumPy's stub matches them with `allow_pickle`
                 )
         except (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
             raise InputError(f"{path}: expected a file that can be written, found: {error.strerror}") from None
@@ -128,19 +127,19 @@ class BevMap:
 
 @dataclass(frozen=True, eq=False)
 class BevArrows:
-    """N flow vectors on the map: each from the centre of its start's map to that of its end's."""
+    """N flow vectors on the map, each from the centre of its start's map to the centre of its end's map."""
 
     starts: BevMap
     ends: BevMap
 
     @property
     def start_m(self) -> np.ndarray:
-        """(N, 2) float64, metres right and forward; NaN where it reaches no cell."""
+        """(N, 2) float64, metres right and forward; NaN as in `BevMap.centres_m`."""
         return self.starts.centres_m
 
     @property
     def end_m(self) -> np.ndarray:
-        """(N, 2) float64, metres right and forward; NaN where it reaches no cell."""
+        """(N, 2) float64, metres right and forward; NaN as in `BevMap.centres_m`."""
         return self.ends.centres_m
 
     @property
@@ -160,5 +159,5 @@ class BevArrows:
 
 
 def color_of(k: int) -> tuple[float, float, float]:
-    """The colour of map number k; colours repeat after some dozens."""
+    """Colour of map number k; colours repeat after some dozens."""
     return to_rgb(_COLORS[k % len(_COLORS)])

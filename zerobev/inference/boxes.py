@@ -11,29 +11,28 @@ from skimage.measure import regionprops
 
 from zerobev.common.errors import InputError
 from zerobev.inference.arrays import as_array
-from zerobev.inference.bev_map import BevMap
-from zerobev.inference.modality import BinaryImages
+from zerobev.inference.modality import BinaryImages, MapModality
 
 _SIDES = ("xmin", "ymin", "xmax", "ymax")
-_MAX_FRACTION = 1.5  # corners given as fractions reach a little beyond the image
+_MAX_FRACTION = 1.5  # corners given as fractions of the image may be slightly outside of it
 Form = Literal["xyxy", "xywh", "cxcywh"]
 
-_LEAST_PX = 12  # an instance of fewer pixels is found by no detector
+_MIN_PX = 12  # smaller instances are not detected
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
-    """N detections in one photograph.
+class Boxes(MapModality):
+    """N detections in one photograph, with one map per box.
 
-    Other formats than corners in pixels: `Boxes.of`.
-    Raises `InputError` for arrays that do not fit each other, for corners that are not finite or in the wrong order,
-    for corners that all lie within one pixel, as fractions of the image do, and for scores outside [0, 1].
+    For formats other than corners in pixels see `Boxes.of`.
+    Raises `InputError` for arrays of different lengths, for corners that are not finite, in the wrong order, or all
+    within one pixel, as fractions of the image would be, and for scores outside [0, 1].
     """
 
     corners: np.ndarray  #: (N, 4) float64: left, top, right, bottom, in pixels from the image's upper left corner
     labels: tuple[str, ...]
     scores: np.ndarray  #: (N,) float64 in [0, 1]
-    source: str = "given"  #: what found them, in words
+    source: str = "given"  #: the detector, in words
 
     def __post_init__(self) -> None:
         try:
@@ -49,10 +48,10 @@ class Boxes:
         for number, (left, top, right, bottom) in enumerate(self.corners):
             if not (np.isfinite([left, top, right, bottom]).all() and left < right and top < bottom):
                 found = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
-                hint = "; for x, y, width, height say Boxes.of(..., form='xywh')"
+                hint = "; for x, y, width, height use Boxes.of(..., form='xywh')"
                 raise InputError(f"boxes: expected xmin < xmax and ymin < ymax in box {number}, found {found}{hint}")
         if count and np.abs(self.corners).max() <= _MAX_FRACTION:
-            hint = "for fractions of the image say Boxes.of(..., size=(height, width))"
+            hint = "for fractions of the image use Boxes.of(..., size=(height, width))"
             raise InputError(f"boxes: expected corners in pixels, found none above {self.corners.max():g}; {hint}")
         if not all(0 <= score <= 1 for score in self.scores):
             raise InputError(f"boxes: expected scores in [0, 1], found {np.min(self.scores)} to {np.max(self.scores)}")
@@ -69,9 +68,9 @@ class Boxes:
         """Boxes in another format.
 
         values: (N, 4) numbers. form "xyxy": left, top, right, bottom; "xywh": left, top, width, height, as in COCO;
-            "cxcywh": centre, width, height, as YOLO and DETR have them
+            "cxcywh": centre, width, height, as in YOLO and DETR
         scores: N in [0, 1]; default: 1
-        size: (H, W) of the photograph, where the values are fractions of it; None: they are pixels
+        size: (H, W) of the photograph if values are fractions of it; None: values are pixels
         Raises `InputError` as the class does, and for fractions outside [-0.5, 1.5].
         """
         boxes, labels = as_array(values, "boxes"), tuple(labels)
@@ -94,7 +93,7 @@ class Boxes:
 
     @classmethod
     def from_table(cls, table: pd.DataFrame, source: str = "given") -> Self:
-        """The rows of a table with columns xmin, ymin, xmax, ymax (pixels), label, and perhaps score (else 1)."""
+        """The rows of a table with columns xmin, ymin, xmax, ymax (pixels), label, and optionally score (else 1)."""
         missing = [name for name in (*_SIDES, "label") if name not in table]
         if missing:
             found = ", ".join(map(str, table.columns))
@@ -108,17 +107,17 @@ class Boxes:
 
     @classmethod
     def read_csv(cls, path: Path) -> Self:
-        """As `from_table`, from a CSV file with a header."""
+        """As `from_table`, from a CSV file with a header. Raises `InputError` if it cannot be read."""
         try:
             table = pd.read_csv(path)
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: expected a CSV table of boxes, found: {error}") from None
         return cls.from_table(table, str(path))
 
-    def images(self, shape: tuple[int, int]) -> BinaryImages:
+    def layers(self, shape: tuple[int, int]) -> tuple[BinaryImages]:
         """Each box as a filled mask of a photograph of `shape` (H, W).
 
-        Raises `InputError` for no box at all, and for one that lies outside: it belongs to an image of another size.
+        Raises `InputError` if there is no box, and for a box outside the photograph.
         """
         if not self.labels:
             raise InputError("modality: expected at least one box, found none")
@@ -127,20 +126,12 @@ class Boxes:
             if left >= width or top >= height or right <= 0 or bottom <= 0:
                 found = f"{left:g}, {top:g}, {right:g}, {bottom:g}"
                 raise InputError(f"modality: expected box {number} within {width} x {height} pixels, found {found}")
-        return BinaryImages(self.labels, self._filled(shape), scores=np.asarray(self.scores, np.float64))
-
-    def layers(self, shape: tuple[int, int]) -> tuple[BinaryImages]:
-        """As `images`."""
-        return (self.images(shape),)
-
-    def result(self, maps: tuple[BevMap, ...]) -> BevMap:
-        """One map per box, with its label and score."""
-        return maps[0]
+        return (BinaryImages(self.labels, self._filled(shape), scores=self.scores),)
 
     def _filled(self, shape: tuple[int, int]) -> Iterator[np.ndarray]:
         for corners in self.corners:
             sides = np.floor(np.clip(corners, -1, max(shape) + 1) + 0.5).astype(int)
-            left, top = sides[:2]  # pixels with their centre inside, and one at least
+            left, top = sides[:2]  # pixels with their centre inside, at least one
             right, bottom = np.maximum(sides[2:], (left + 1, top + 1))
             image = np.zeros(shape, bool)
             image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = True
@@ -154,26 +145,26 @@ def rendered_boxes(
     jitter: float = 0.05,
     misses: float = 0.1,
 ) -> Boxes:
-    """Boxes of rendered instances, spoilt a little: they stand in for a detector where there is none, and say so.
+    """Simulated detections: boxes of rendered instances with noise; `source` states this.
 
-    instance: (H, W) integers, the instance that each pixel sees
-    names: instance id -> label, of the instances that count as objects
-    jitter: standard deviation of each side, as a share of the box's width or height
-    misses: share of the objects that are not found
-    The score of a box is its overlap (IoU) with the true one.
+    instance: (H, W) integers, instance id per pixel
+    names: instance id -> label, of the objects to detect
+    jitter: standard deviation of each side, as a fraction of the box's width or height
+    misses: fraction of the objects without a detection
+    The score of a box is its overlap (IoU) with the true box.
     """
     found: list[tuple[np.ndarray, str, float]] = []
     for region in regionprops(np.asarray(instance).astype(np.int64)):
-        if region.label not in names or region.area < _LEAST_PX:
+        if region.label not in names or region.area < _MIN_PX:
             continue
         missed, shifts = rng.random() < misses, rng.normal(0, jitter, 4)
         top, left, bottom, right = region.bbox
         true = np.array([left, top, right, bottom], np.float64)
         size = np.array([right - left, bottom - top] * 2)
         limits = np.array([instance.shape[1], instance.shape[0]] * 2)
-        spoilt = np.clip(true + shifts * size, 0, limits)
-        if not missed and (spoilt[2:] - spoilt[:2] >= 1).all():
-            found.append((spoilt, names[region.label], _overlap(true, spoilt)))
+        noisy = np.clip(true + shifts * size, 0, limits)
+        if not missed and (noisy[2:] - noisy[:2] >= 1).all():
+            found.append((noisy, names[region.label], _overlap(true, noisy)))
     corners = np.array([corners for corners, _, _ in found]).reshape(-1, 4)
     scores = np.array([score for _, _, score in found], np.float64)
     return Boxes(corners, tuple(label for _, label, _ in found), scores, "rendered instances, jittered, some missed")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import torch
 
-from zerobev.common.errors import InputError
+from zerobev.common.errors import InputError, first_line
 from zerobev.inference.boxes import Boxes
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class HubDetector:
-    """A detector with the image processor that belongs to it (DETR, YOLOS, RT-DETR, ...)."""
+    """A detector with its image processor (DETR, YOLOS, RT-DETR, ...)."""
 
     def __init__(self, network: "PreTrainedModel", processor: "BaseImageProcessor", source: str) -> None:
         self._network, self._processor, self._source = network.eval(), processor, source
@@ -23,15 +23,15 @@ class HubDetector:
     def from_pretrained(cls, source: str | Path) -> Self:
         """The detector in a folder or under a name on the Hugging Face hub.
 
-        Raises `InputError` where there is none, or one that lacks weights or its image processor.
+        Raises `InputError` if there is none, or if weights or the image processor are missing.
         """
-        from transformers import AutoImageProcessor, AutoModelForObjectDetection  # takes seconds
+        from transformers import AutoImageProcessor, AutoModelForObjectDetection  # slow to import
 
         try:
             network, report = AutoModelForObjectDetection.from_pretrained(str(source), output_loading_info=True)
             processor = AutoImageProcessor.from_pretrained(str(source))
         except (OSError, ValueError, RuntimeError, ImportError) as error:
-            found = str(error).strip().splitlines()[0]
+            found = first_line(error)
             raise InputError(f"{source}: expected an object detector of transformers, found: {found}") from error
         if report["missing_keys"]:
             raise InputError(f"{source}: expected the weight {min(report['missing_keys'])}, found none of this name")

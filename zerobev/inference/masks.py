@@ -1,4 +1,4 @@
-"""Masks: one binary image per thing."""
+"""Masks: one binary image per object."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,51 +9,46 @@ import numpy as np
 
 from zerobev.common.errors import InputError
 from zerobev.inference.arrays import Channels, as_array, stacked
-from zerobev.inference.bev_map import BevMap
-from zerobev.inference.modality import BinaryImages, chosen_names
+from zerobev.inference.modality import BinaryImages, MapModality, chosen_names
 from zerobev.inference.reader import Source, black_and_white, read_mask
 
 
 @dataclass(frozen=True, eq=False)
-class Masks:
-    """K masks of one photograph, as arrays."""
+class Masks(MapModality):
+    """K masks of one photograph, with one map per mask."""
 
-    #: (H, W), (K, H, W) or (H, W, K): bool, 0 and 1, or black and white of uint8 or uint16 (see `black_and_white`);
-    #: also a list of K images
+    #: (H, W), (K, H, W), (H, W, K) or a list of K images: bool, 0 and 1, or black and white (see `black_and_white`)
     values: Any
-    names: Sequence[str] | None = None  #: K names; default: their numbers
+    names: Sequence[str] | None = None  #: K names; default: the numbers
     channels: Channels = None
 
     @classmethod
     def read(cls, *sources: Source, names: Sequence[str] | None = None) -> Self:
-        """Masks from one image file each; named by their files. Raises `InputError`, see `read_mask`."""
+        """Masks from one image file each.
+
+        names: default: the files' names without suffixes, if all sources are paths
+        Raises `InputError` as `read_mask`, and for masks of different sizes.
+        """
         if not sources:
             raise InputError("masks: expected an image file at least, found none")
         masks = [read_mask(source) for source in sources]
+        paths = [Path(source) for source in sources if isinstance(source, str | Path)]
         for source, mask in zip(sources, masks):
             if mask.shape != masks[0].shape:
-                found = f"{mask.shape} beside {masks[0].shape}"
-                raise InputError(f"{_name(source)}: expected masks of one size, found {found}")
-        if names is None and all(isinstance(source, str | Path) for source in sources):
-            names = [_name(source) for source in sources]
+                name = source if isinstance(source, str | Path) else "mask"
+                raise InputError(f"{name}: expected masks of one size, found {mask.shape} and {masks[0].shape}")
+        if names is None and len(paths) == len(sources):
+            names = [path.stem for path in paths]
         return cls(np.stack(masks), names, "first")
 
     def layers(self, shape: tuple[int, int]) -> tuple[BinaryImages]:
-        """One binary image per mask; an `InputError` for another size or type, and for grey levels."""
+        """One binary image per mask. Raises `InputError` for another size or type, and for grey levels."""
         array = as_array(self.values, "modality")
         if array.dtype.kind not in "biuf":
             raise InputError(f"modality: expected an array of bool or of numbers, found {array.dtype}")
         images = stacked(array, shape, self.channels, "Masks")
         if array.ndim == 3 and self.channels is None and images is not array and len(images) in (3, 4):
-            hint = "take one channel of a colour image, or say channels='last' for as many masks"
+            hint = "take one channel of a colour image, or pass channels='last' for as many masks"
             raise InputError(f"modality: expected (H, W) or (K, H, W), found {array.shape}: {hint}")
         labels = chosen_names(range(len(images)), self.names)
         return (BinaryImages(labels, [black_and_white(image, "modality") for image in images]),)
-
-    def result(self, maps: tuple[BevMap, ...]) -> BevMap:
-        """One map per mask."""
-        return maps[0]
-
-
-def _name(source: Source) -> str:
-    return Path(source).stem if isinstance(source, str | Path) else "mask"

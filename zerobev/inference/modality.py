@@ -1,4 +1,4 @@
-"""The interface of a modality, and what it is made of: binary images.
+"""The interface of a modality, and its parts: binary images.
 
 A new kind is one class with the two methods of `Modality`, and a line in `zerobev.inference.__init__`.
 """
@@ -21,28 +21,36 @@ class BinaryImages:
     """K modalities, each as `levels` binary images of a photograph's size."""
 
     labels: tuple[str, ...]  #: K names
-    images: Iterable[np.ndarray]  #: K * levels (H, W) bool, level fastest; may be made one at a time
+    images: Iterable[np.ndarray]  #: K * levels (H, W) bool, level fastest; may be a generator
     levels: int = 1
-    scores: np.ndarray | None = None  #: (K,) float64, of modalities that have one
-    photograph: np.ndarray | None = None  #: (H, W, 3) that they belong to; None: the one that is projected
+    scores: np.ndarray | None = None  #: (K,) float64, of detections
+    photograph: np.ndarray | None = None  #: (H, W, 3) of these images; None: the argument of `project`
 
 
 @runtime_checkable
 class Modality(Protocol[Result]):
-    """Something known in a photograph, that becomes binary images, and that maps of these become again."""
+    """First-person data of a photograph, to be projected as binary images."""
 
     def layers(self, shape: tuple[int, int]) -> tuple[BinaryImages, ...]:
-        """Binary images for a photograph of `shape` (H, W), one set per map to be made.
+        """Sets of binary images for a photograph of `shape` (H, W); each set is projected to one `BevMap`.
 
-        Raises `InputError` where the modality does not fit this shape, or is empty.
+        Raises `InputError` if the modality does not fit this shape, or is empty.
         """
 
     def result(self, maps: tuple[BevMap, ...]) -> Result:
         """The result of `project`, from one map per set of `layers`."""
 
 
+class MapModality:
+    """Base of modalities with one set of binary images; the result is their `BevMap`."""
+
+    def result(self, maps: tuple[BevMap, ...]) -> BevMap:
+        """The only map."""
+        return maps[0]
+
+
 def chosen_names(numbers: Iterable[int], names: Names) -> tuple[str, ...]:
-    """The names of the given numbers, by default the numbers themselves; an `InputError` if one is missing."""
+    """The names of the given numbers, by default the numbers. Raises `InputError` if one is missing."""
     if names is None:
         return tuple(map(str, numbers))
     try:

@@ -1,4 +1,4 @@
-"""The kind of a plain array: by its type and values where these leave one reading, else an error with the readings."""
+"""The kind of a plain array, by its type and values; ambiguous arrays are an error that lists the possible kinds."""
 
 from typing import Any
 
@@ -11,17 +11,17 @@ from zerobev.inference.masks import Masks
 from zerobev.inference.modality import Names
 from zerobev.inference.probabilities import Probabilities
 
-_NEAR = 16  # grey values of a JPEG mask are this close to black or white, and a few are not
+_NEAR = 16  # most grey values of a JPEG mask are this close to black or white
 
 
 def kind_of(value: Any, shape: tuple[int, int], names: Names = None) -> Masks | Labels | Probabilities:
     """The kind of a plain array for a photograph of `shape` (H, W).
 
     bool (H, W) or (K, H, W): `Masks`; integers (H, W): `Labels`; floating point (H, W) or (K, H, W): `Probabilities`
-    Raises `InputError`, which names the kinds, for
-        - integers (H, W) of 0 and 1, or close to 0 and 255: a mask or labels, unless `names` name the labels
-        - integers (H, W) with 255 among other labels: a label or pixels without one, unless `names` decide it
-        - integers in three dimensions, unless they are 0 and 1 or 0 and 255
+    Raises `InputError`, with the possible kinds, for
+        - integers (H, W) of 0 and 1, or close to 0 and 255: a mask or labels, unless `names` has a name for each
+        - integers (H, W) with 255 as the largest label: a label or "no label", unless decided by `names`
+        - integers in three dimensions other than 0 and 1, or 0 and 255
         - (H, W, 2) floating point: flow or two probabilities; (H, W, 3) and (H, W, 4): also a colour image
     """
     array = as_array(value, "modality")
@@ -31,7 +31,7 @@ def kind_of(value: Any, shape: tuple[int, int], names: Names = None) -> Masks | 
     if array.ndim == 3 and array.size and array.shape[:2] == tuple(shape) and array.shape[1:] != tuple(shape):
         _refuse_pixels(array)
     if kind == "b":
-        return Masks(array, names)  # type: ignore[arg-type]  # names by number serve as well
+        return Masks(array, names)  # type: ignore[arg-type]  # names by number work, too
     if kind == "f":
         return Probabilities(array, names)  # type: ignore[arg-type]
     if array.ndim == 3 and array.size:
@@ -43,19 +43,19 @@ def kind_of(value: Any, shape: tuple[int, int], names: Names = None) -> Masks | 
 
 
 def _refuse_pixels(array: np.ndarray) -> None:
-    """An `InputError` where the last axis may hold something else than images."""
-    depth = array.shape[-1]
-    if depth == 2 and array.dtype.kind == "f":
-        found = f"{array.shape}: say Flow.of(array), or Probabilities(array, channels='last')"
+    """Raise `InputError` if the last axis may be flow or the channels of a colour image."""
+    channels = array.shape[-1]
+    if channels == 2 and array.dtype.kind == "f":
+        found = f"{array.shape}: use Flow.of(array), or Probabilities(array, channels='last')"
         raise InputError(f"modality: expected one kind, found flow or probabilities in {found}")
-    if depth in (3, 4):
-        kind = {"b": "Masks", "f": "Probabilities"}.get(array.dtype.kind, "Masks")
-        found = f"{array.shape}: take one channel, or say {kind}(array, channels='last') for {depth} images"
-        raise InputError(f"modality: expected one kind, found a colour image or {depth} images in {found}")
+    if channels in (3, 4):
+        kind = "Probabilities" if array.dtype.kind == "f" else "Masks"
+        found = f"{array.shape}: take one channel, or use {kind}(array, channels='last') for {channels} images"
+        raise InputError(f"modality: expected one kind, found a colour image or {channels} images in {found}")
 
 
 def _ignored(array: np.ndarray, names: Names) -> int | None:
-    """The label that counts as none, of a label map; an `InputError` where that is open, or where it may be a mask."""
+    """Label for "no label" in a label map. Raises `InputError` if this is ambiguous, or if it may be a mask."""
     levels = np.unique(array)
     is_binary = levels[0] >= 0 and levels[-1] <= 1
     is_black_or_white = levels[-1] <= 255 and levels[-1] >= 255 - _NEAR and levels[0] >= 0
@@ -63,20 +63,20 @@ def _ignored(array: np.ndarray, names: Names) -> int | None:
     if is_binary or (is_black_or_white and IGNORE not in levels) or set(levels) <= {0, IGNORE}:
         if _names_all(names, levels):
             return None
-        found = f"integers from {levels[0]} to {levels[-1]}: say Masks(array), or Labels(array)"
+        found = f"integers from {levels[0]} to {levels[-1]}: use Masks(array), or Labels(array)"
         raise InputError(f"modality: expected one kind, found a mask or a label map in {found}")
     if IGNORE in levels and levels[-1] == IGNORE:
         if _names_all(names, levels):
             return None
-        if names is not None:  # it has none, so it is no label
+        if names is not None:  # a value without a name is not a label
             return IGNORE
-        found = f"{IGNORE}: say Labels(array, ignore={IGNORE}), or Labels(array) where it is a label like others"
+        found = f"{IGNORE}: use Labels(array, ignore={IGNORE}), or Labels(array) if it is an ordinary label"
         raise InputError(f"modality: expected labels, found one that often means no label, {found}; or Masks(array)")
     return None
 
 
 def _names_all(names: Names, levels: np.ndarray) -> bool:
-    """Whether there is a name for every label, so that they are labels."""
+    """Whether every label has a name."""
     if names is None:
         return False
     try:

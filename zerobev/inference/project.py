@@ -1,7 +1,7 @@
 """Project masks, labels or boxes of an image to a map.
 
-Reads a photograph and masks, a label map or a table of boxes (rules for image files: `zerobev.inference.reader`), or
-runs a detector on it. Writes the photograph beside its map as PNG, and values, maps and metric grid as NPZ of the same
+Reads a photograph and its masks, label map or table of boxes (rules for image files: `zerobev.inference.reader`), or
+runs a detector; writes a picture of photograph and map as PNG, and values, maps and metric grid as NPZ of the same
 name.
 """
 
@@ -20,14 +20,14 @@ from zerobev.inference.labels import IGNORE, Labels
 from zerobev.inference.masks import Masks
 from zerobev.inference.modality import BinaryImages, Modality
 from zerobev.inference.projector import GEOMETRIC, load
-from zerobev.inference.reader import read_image, read_labels, read_mask
+from zerobev.inference.reader import read_image, read_labels
 from zerobev.inference.shipped_weights import ROWS
 
 _OPACITY = 0.5
 
 
 def figure_of(rgb: np.ndarray, images: BinaryImages, bev: BevMap) -> plt.Figure:
-    """The photograph under its masks, and the map."""
+    """The photograph with its masks on top, and the map."""
     shown = rgb / 255
     for k, mask in enumerate(images.images):
         shown = np.where(mask[..., None], (1 - _OPACITY) * shown + _OPACITY * np.array(color_of(k)), shown)
@@ -42,12 +42,12 @@ def figure_of(rgb: np.ndarray, images: BinaryImages, bev: BevMap) -> plt.Figure:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `zerobev project`."""
     parser.add_argument("image", type=Path, metavar="IMAGE", help="photograph, taken level, 0.88 m above the floor")
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--masks", type=Path, nargs="+", metavar="FILE", help="images that are black outside the mask")
-    what.add_argument("--labels", type=Path, metavar="FILE", help="image of labels: grey values or palette indices")
-    what.add_argument("--boxes", type=Path, metavar="FILE", help="CSV: xmin,ymin,xmax,ymax,label and perhaps score")
-    what.add_argument("--detector", metavar="NAME", help="object detector of transformers: hub name or folder")
-    parser.add_argument("--ignore", metavar="LABEL", help=f"label of pixels without one, often {IGNORE}; or none")
+    kind = parser.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--masks", type=Path, nargs="+", metavar="FILE", help="images that are black outside the mask")
+    kind.add_argument("--labels", type=Path, metavar="FILE", help="image of labels: grey values or palette indices")
+    kind.add_argument("--boxes", type=Path, metavar="FILE", help="CSV: xmin,ymin,xmax,ymax,label and optionally score")
+    kind.add_argument("--detector", metavar="NAME", help="object detector of transformers: hub name or folder")
+    parser.add_argument("--ignore", metavar="LABEL", help=f"label of pixels without a class, often {IGNORE}; or none")
     parser.add_argument("--hfov", type=float, default=79.0, help="horizontal field of view, degrees; default 79")
     parser.add_argument("--row", default=ROWS[-1], help=f"one of {', '.join((GEOMETRIC, *ROWS))}, or a checkpoint")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="an NPZ is written beside it")
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--out: expected a name that ends in .png, found {options.out}")
     if options.ignore is not None and not options.labels:
         raise InputError("--ignore: expected beside --labels, found without")
-    plt.switch_backend("agg")  # no window is opened
+    plt.switch_backend("agg")  # without a window
     rgb = read_image(options.image)
     modality = _modality(options, rgb)
     (images,) = modality.layers(rgb.shape[:2])
@@ -71,24 +71,23 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _modality(options: argparse.Namespace, rgb: np.ndarray) -> Modality[BevMap]:
-    """The modality that the options name."""
+    """The modality chosen by the options."""
     if options.labels:
         return _labels(options.labels, options.ignore)
     if options.boxes:
         return Boxes.read_csv(options.boxes)
     if options.detector:
         return HubDetector.from_pretrained(options.detector).detect(rgb)
-    masks = [read_mask(path) for path in options.masks]
-    for path, mask in zip(options.masks, masks):
-        if mask.shape != rgb.shape[:2]:
-            raise InputError(f"{path}: expected the photograph's size {rgb.shape[:2]}, found {mask.shape}")
-    return Masks(np.stack(masks), [path.stem for path in options.masks], "first")
+    masks = Masks.read(*options.masks)
+    if (size := masks.values.shape[1:]) != rgb.shape[:2]:
+        raise InputError(f"{options.masks[0]}: expected the photograph's size {rgb.shape[:2]}, found {size}")
+    return masks
 
 
 def _labels(path: Path, ignore: str | None) -> Labels:
     labels = read_labels(path)
     if ignore is None and labels.max() == IGNORE:
-        choice = f"--ignore {IGNORE} where it means no label, --ignore none where it is one"
+        choice = f"--ignore {IGNORE} if it means no label, --ignore none if it is a label"
         raise InputError(f"{path}: expected a choice for label {IGNORE}, found none: {choice}")
     try:
         return Labels(labels, ignore=None if ignore in (None, "none") else int(ignore))

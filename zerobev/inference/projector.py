@@ -7,7 +7,6 @@ from typing import Any, overload
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from zerobev.common.errors import InputError
@@ -21,23 +20,24 @@ from zerobev.inference.pinhole import PinholeView
 from zerobev.inference.plain_arrays import kind_of
 from zerobev.inference.shipped_weights import DEPTH, ROWS, shipped
 from zerobev.models import TIM, VPN, BevModel, load_model
+from zerobev.models.decoder import resize
 from zerobev.models.depth import DepthEstimator, DepthNet
 
-#: The row that is not trained: P^-1 with estimated depth.
+#: The row without a network: P^-1 with estimated depth.
 GEOMETRIC = "a.2"
-#: Binary images that one call takes; a network holds the features of all of them at once.
+#: Maximum number of binary images per call; the features of all of them are in memory at the same time.
 MAX_IMAGES = 2048
-_MAX_MEDIAN_M = 200.0  # no photograph of a place to walk in shows more
+_MAX_MEDIAN_M = 200.0  # larger median depths are probably in millimetres
 
 
 @dataclass(frozen=True, eq=False)
 class Projector:
-    """A network, or P^-1, with the depth estimator and the camera it belongs to; both are on the CPU.
+    """A network, or P^-1, with its camera and a depth estimator, on the CPU.
 
-    Raises `InputError` for one on another device.
+    Raises `InputError` for a network or estimator on another device.
     """
 
-    row: str  #: of Tables 1 and 2, or the file that it comes from
+    row: str  #: of Tables 1 and 2, or the path of the checkpoint
     camera: CameraConfig
     network: BevModel | None  #: None: P^-1 (row (a.2))
     estimator: DepthEstimator
@@ -57,7 +57,7 @@ class Projector:
     def project(self, rgb: Any, modality: Any, hfov_deg: float = ..., names: Names = ...) -> BevMap: ...
 
     def project(self, rgb: Any, modality: Any, hfov_deg: float = 79.0, names: Names = None) -> BevMap | BevArrows:
-        """Project what is known in a photograph to the map of the 5 m in front of its camera.
+        """Project a modality of a photograph to the map of the 5 m in front of its camera.
 
         rgb: (H, W, 3) uint8, or floating point in [0, 1], of any size up to `reader.MAX_MEGAPIXELS`; or an image file
             (path, bytes, open file, PIL image), see `zerobev.inference.reader`
@@ -66,20 +66,19 @@ class Projector:
             - `Boxes`: one map per detection, with its label and score
             - `Flow`: arrows
             - another `Modality`
-            - an array whose type and values leave one kind: bool (H, W) or (K, H, W) masks; integers (H, W) labels;
-              floating point (H, W) or (K, H, W) probabilities. See `plain_arrays.kind_of` for those that do not.
+            - an array of an unambiguous kind: bool (H, W) or (K, H, W) masks; integers (H, W) labels; floating point
+              (H, W) or (K, H, W) probabilities. See `plain_arrays.kind_of` for ambiguous arrays.
         hfov_deg: the photograph's horizontal field of view; its pixels are square
-        names: of the masks, labels or images of an array; default: their numbers
+        names: of the masks, labels or images of an array; default: the numbers
 
-        The network's camera is level, 0.88 m above the floor, and sees 79 degrees; a photograph is resampled to it. Of
-        that view, what the photograph does not cover goes on with the colours at its border, masks are empty there, and
-        the map ends; what lies outside is cut off.
-        A photograph taken from another height, or tilted, gives maps that are off by as much as that moves the floor in
-        the image. Maps of empty masks are empty.
+        The network's camera is level, 0.88 m above the floor, with a field of view of 79 degrees. Photographs are
+        resampled to this view: parts outside of it are cropped. Parts of the view without photograph get the colours at
+        its border, have empty masks, and are outside the map's field of view.
+        Another camera height, or a tilted camera, displaces the floor in the photograph, and maps accordingly. Maps of
+        empty masks are empty.
 
         Returns a `BevArrows` for `Flow`, else a `BevMap`. Raises `InputError` for wrong shapes, types or ranges, NaN,
-        input that is empty, arrays that can be read in two ways, and more than `MAX_IMAGES` binary images (real values
-        are eight each).
+        empty input, ambiguous arrays, and more than `MAX_IMAGES` binary images (eight per image of real values).
         """
         photograph = checked_image(rgb)
         shape = photograph.shape[:2]
@@ -89,25 +88,24 @@ class Projector:
         return kind.result(tuple(self._maps(frame, layer, hfov_deg) for frame, layer in zip(frames, layers)))
 
     def depth(self, rgb: Any, hfov_deg: float = 79.0) -> np.ndarray:
-        """Estimated planar depth in the network's camera, (S, S) float32, metres; 0 where nothing is covered."""
+        """Estimated planar depth in the network's camera, (S, S) float32, metres; 0 outside the photograph."""
         photograph = checked_image(rgb)
         view = PinholeView(photograph.shape[:2], hfov_deg, self.camera)
         with torch.inference_mode():
             return self._depth(photograph, hfov_deg, view)[0, 0].numpy()
 
     def _depth(self, photograph: np.ndarray, hfov_deg: float, view: PinholeView) -> Tensor:
-        """(1, 1, S, S) metres. An estimator with an input size of its own sees the photograph at that size."""
+        """(1, 1, S, S) metres; the estimator's input has its `side_px`, if it has one."""
         side = self.camera.fpv_px
-        own_px = max(getattr(self.estimator, "side_px", side), side)
-        seen = view
-        if own_px > side and (in_view := view.resolution_px) > side:
-            # not larger than the photograph, which the estimator enlarges smoothly
-            camera = replace(self.camera, fpv_px=min(own_px, in_view))
-            seen = PinholeView(photograph.shape[:2], hfov_deg, camera)
-        depth = _checked_depth(self.estimator(_batch(seen.photograph(photograph))), seen.covered.shape)
-        if depth.shape[-1] != side:
-            depth = F.interpolate(depth, size=(side, side), mode="bilinear", align_corners=False)
-        return depth * torch.from_numpy(view.covered)
+        # at most the resolution of the photograph, which the estimator enlarges smoothly
+        input_px = min(getattr(self.estimator, "side_px", side), view.resolution_px)
+        if input_px > side:
+            camera = replace(self.camera, fpv_px=input_px)
+            fine_view = PinholeView(photograph.shape[:2], hfov_deg, camera)
+        else:
+            fine_view = view
+        depth = _checked_depth(self.estimator(_batch(fine_view.photograph(photograph))), fine_view.covered.shape)
+        return resize(depth, (side, side)) * torch.from_numpy(view.covered)
 
     @torch.inference_mode()
     def _maps(self, photograph: np.ndarray, images: BinaryImages, hfov_deg: float) -> BevMap:
@@ -126,7 +124,7 @@ class Projector:
         return BevMap(values, images.labels, evidence, fov, self.camera, images.scores)
 
     def _values_and_evidence(self, rgb: Tensor, zero: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """Images (K, S, S) of one photograph -> (K, M, M) probabilities, and the rise of logits over an empty image."""
+        """Images (K, S, S) of one photograph -> (K, M, M) `BevMap.values` and `BevMap.evidence`."""
         if self.network is None:
             values = inverse_project(zero[None], depth, self.camera)[0]
             return values, values
@@ -135,10 +133,7 @@ class Projector:
         return logits[:-1].sigmoid(), (logits[:-1] - logits[-1]).clamp(min=0)
 
     def predict(self, batch: Mapping[str, Tensor]) -> Tensor:
-        """A batch of `data.samples` -> maps (B, K, M, M) bool, as `evaluation.evaluate` takes them.
-
-        Depth is estimated; the batch's own, which is true, is not read.
-        """
+        """A batch of `data.samples` -> maps (B, K, M, M) bool, for `evaluation.evaluate`; with estimated depth."""
         depth = self.estimator(batch["rgb"])
         if self.network is None:
             return inverse_project(batch["zero"], depth, self.camera) > 0.5
@@ -146,12 +141,12 @@ class Projector:
 
 
 def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None) -> Projector:
-    """A projector, from weights that ship with the package or from a checkpoint of your own.
+    """A projector with shipped weights, or from your checkpoint.
 
     source: a shipped row (`shipped_weights.ROWS`), "a.2" for the projection P^-1, or the path of a checkpoint
-    estimator: of metric depth, for the field of view, P^-1 and residual networks; default: the one that ships
-    Raises `InputError` for an unknown row, a file that is no network for zero-shot projection, and where the shipped
-    depth estimator does not fit the network's camera.
+    estimator: of metric depth, for the field of view, P^-1 and residual networks; default: the shipped one
+    Raises `InputError` for an unknown row, for a file other than a zero-shot network, and if the shipped depth
+    estimator does not fit the network's camera.
     """
     depth = DepthNet.load(shipped(DEPTH)) if estimator is None else estimator
     if source == GEOMETRIC:
@@ -171,12 +166,12 @@ def _kind(modality: Any, shape: tuple[int, int], names: Names) -> Modality[Any]:
     if names is None:
         return modality
     if getattr(modality, "names", ()) is not None:
-        raise InputError(f"names: expected none beside {type(modality).__name__}, which has its own")
+        raise InputError(f"names: expected none for {type(modality).__name__}, which contains its names")
     return replace(modality, names=names)  # type: ignore[type-var]  # a dataclass with a field of this name
 
 
 def _checked_depth(depth: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """What an estimator returned, (1, 1, S, S); an `InputError` where it cannot be metres."""
+    """Output of an estimator, (1, 1, S, S). Raises `InputError` if it cannot be metres."""
     expected = (1, 1, *shape)
     if tuple(depth.shape) != expected:
         raise InputError(f"estimator: expected depth {expected}, found {tuple(depth.shape)}")

@@ -1,7 +1,7 @@
 """Image files -> arrays: one reader for photographs, masks and label maps.
 
-A source is a path, the bytes of a file, an open binary file, or a PIL image. Photographs, masks and label maps are all
-turned upright by the EXIF orientation in their own file. A file without one counts as upright.
+A source is a path, the bytes of a file, an open binary file, or a PIL image. Photographs, masks and label maps are
+turned upright by the EXIF orientation of their file. A file without one is upright.
 
 | image | photograph | mask | label map |
 |---|---|---|---|
@@ -17,9 +17,9 @@ turned upright by the EXIF orientation in their own file. A file without one cou
 | JPEG, JPEG 2000 | as its mode | as its mode | refused: compression changes labels |
 | several frames, pages | refused | refused | refused |
 
-White, in a grey mask: 0 and one other value are black and white. Of more values those from half of the largest that
-the type can hold are white, where nearly all are close to black or to white, as JPEG and smooth edges leave them.
-Other grey levels are refused: they are a label map, or a mask that needs a threshold of your choice.
+White, in a grey mask: 0 and one other value are black and white. With more values, those from half of the type's
+maximum are white, if nearly all are close to black or to white, as after JPEG compression and on smooth edges. Other
+grey levels are refused: they are a label map, or a mask that needs a threshold of your choice.
 
 Files: PNG, JPEG, TIFF, WebP, BMP, GIF, PPM, JPEG 2000, AVIF, up to `MAX_MEGAPIXELS`. Colour profiles are not applied.
 """
@@ -49,16 +49,16 @@ _WITH_ALPHA = ("LA", "La", "PA", "RGBA", "RGBa")
 _SPREAD = {"L;2": 85, "L;4": 17}
 _MAX_CHROMA = 32  # difference of the channels of a grey pixel, after JPEG
 _MAX_GREYS = 0.1  # fraction of the pixels of a mask that may be neither black nor white
-_MAX_LEVEL = 0.01  # likewise, of one and the same grey
+_MAX_LEVEL = 0.01  # likewise, of any one grey level
 
 
 def is_source(value: object) -> bool:
-    """Whether a value is an image file or a PIL image, rather than an array."""
+    """Whether a value is an image file or a PIL image."""
     return isinstance(value, str | Path | bytes | bytearray | memoryview | Image.Image) or hasattr(value, "read")
 
 
 def read_image(source: Source) -> np.ndarray:
-    """A photograph, (H, W, 3) uint8, upright. Raises `InputError` for what the table refuses."""
+    """A photograph, (H, W, 3) uint8, upright. Raises `InputError` as in the table."""
     opened = _open(source, "photograph")
     image = opened.image
     if image.mode in _GREY_16:
@@ -73,7 +73,7 @@ def read_image(source: Source) -> np.ndarray:
 
 
 def read_mask(source: Source) -> np.ndarray:
-    """A mask, (H, W) bool, upright. Raises `InputError` for what the table refuses."""
+    """A mask, (H, W) bool, upright. Raises `InputError` as in the table."""
     opened = _open(source, "mask")
     alpha = _alpha(opened.image)
     if alpha is None:
@@ -83,16 +83,16 @@ def read_mask(source: Source) -> np.ndarray:
     visible = black_and_white(alpha, f"{opened.name}, transparency")
     try:
         white = _white(opened)[visible]
-    except InputError:  # a cut-out: its colours are those of the object
+    except InputError:  # a cut-out in the colours of the object
         return visible
     if white.any() and not white.all():
         found = "black and white in the visible part, and transparency"
-        raise InputError(f"{opened.name}: expected one mask, found {found}: remove the one that is not the mask")
+        raise InputError(f"{opened.name}: expected one mask, found {found}: remove one of them")
     return visible
 
 
 def read_labels(source: Source) -> np.ndarray:
-    """A label map, (H, W) int64, upright. Raises `InputError` for what the table refuses."""
+    """A label map, (H, W) int64, upright. Raises `InputError` as in the table."""
     opened = _open(source, "label map")
     mode = opened.image.mode
     if opened.is_lossy:
@@ -107,7 +107,7 @@ def read_labels(source: Source) -> np.ndarray:
 def black_and_white(values: np.ndarray, name: str) -> np.ndarray:
     """Grey values of a mask -> (..., ) bool, by the rule under the table of this module.
 
-    values: bool, integers or floating point; the largest value is 255, or 65535 if there are larger ones
+    values: bool, integers or floating point; the type's maximum is 255, or 65535 if there are larger values
     Raises `InputError` for other grey levels, negative values and NaN.
     """
     if values.dtype.kind == "b":
@@ -132,12 +132,12 @@ class _Opened:
     image: Image.Image  #: loaded and upright
     name: str  #: for messages
     is_lossy: bool
-    is_rescaled: bool  #: the values are not those in the file, and cannot be told from these
-    spread: int  #: grey values are those in the file times this
+    is_rescaled: bool  #: Pillow has rescaled the values of the file, irreversibly
+    spread: int  #: factor of Pillow on the grey values of the file
 
 
-def _open(source: Source, what: str) -> _Opened:
-    name = str(source) if isinstance(source, str | Path) else what
+def _open(source: Source, kind: str) -> _Opened:
+    name = str(source) if isinstance(source, str | Path) else kind
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is checked below
@@ -160,7 +160,7 @@ def _open(source: Source, what: str) -> _Opened:
         found = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{name}: expected an image, found a damaged one: {found}") from None
     if frames > 1 and image.format != "MPO":  # the second image of a camera's MPO is a preview or a depth map
-        raise InputError(f"{name}: expected one image, found {frames} frames or pages: save the one that is meant")
+        raise InputError(f"{name}: expected one image, found {frames} frames or pages: save one of them")
     compression = str(image.info.get("compression", ""))
     is_lossy = image.format in ("JPEG", "MPO", "JPEG2000") or compression in ("jpeg", "tiff_jpeg", "webp")
     is_rescaled = image.format == "PPM" and codec in ("ppm", "ppm_plain")
@@ -168,7 +168,7 @@ def _open(source: Source, what: str) -> _Opened:
 
 
 def _stored_as(image: Image.Image) -> tuple[str, str]:
-    """Pillow's names of the codec and of the packing of pixels in a file that is not loaded yet; else empty."""
+    """Pillow's names of the codec and of the pixel format of a file, before it is loaded; empty without a file."""
     tiles = getattr(image, "tile", None)
     if not tiles:
         return "", ""
@@ -182,7 +182,7 @@ def _file(source: str | Path | bytes | bytearray | memoryview | BinaryIO) -> Pat
     return Path(source) if isinstance(source, str | Path) else source
 
 
-_TOO_LARGE = f"expected at most {MAX_MEGAPIXELS} megapixels: scale photograph and masks down alike"
+_TOO_LARGE = f"expected at most {MAX_MEGAPIXELS} megapixels: scale photograph and masks down equally"
 
 
 def _check_size(image: Image.Image, name: str) -> None:
@@ -194,7 +194,7 @@ def _check_size(image: Image.Image, name: str) -> None:
 
 
 def _alpha(image: Image.Image) -> np.ndarray | None:
-    """(H, W) uint8, 255 is opaque; None if all of it is."""
+    """(H, W) uint8, 255 is opaque; None if the image is opaque."""
     if image.mode not in ("1", "L", "P", "RGB", *_WITH_ALPHA) or not image.has_transparency_data:
         return None
     if image.mode == "La":
@@ -204,7 +204,7 @@ def _alpha(image: Image.Image) -> np.ndarray | None:
 
 
 def _white(opened: _Opened) -> np.ndarray:
-    """(H, W) bool: the mask by its grey values or colours."""
+    """(H, W) bool: the mask from its grey values or colours."""
     image = opened.image
     if image.mode in _GREY:
         return black_and_white(np.asarray(image), opened.name)

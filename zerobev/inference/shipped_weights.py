@@ -1,4 +1,4 @@
-"""The trained weights that ship with the package; `experiments.release` makes them."""
+"""Trained weights shipped with the package; made by `experiments.release`."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ from safetensors import safe_open
 
 from zerobev.common.errors import InputError
 
-#: Rows whose weights ship; `zerobev.load()` gives the last one.
+#: Rows with shipped weights; the last one is the default of `zerobev.load`.
 ROWS = ("c", "d")
 #: Name of the depth estimator among the shipped files.
 DEPTH = "depth"
@@ -16,19 +16,19 @@ FOLDER = Path(__file__).with_name("shipped")
 
 
 def shipped(name: str) -> Path:
-    """The file of a row's weights, or of the depth estimator's; an `InputError` where it is missing."""
+    """File of the weights of a row, or of the depth estimator. Raises `InputError` if it is missing."""
     path = FOLDER / f"{name}.safetensors"
     if not path.is_file():
-        raise InputError(f"{path}: expected weights that ship with the package, found nothing")
+        raise InputError(f"{path}: expected shipped weights, found nothing")
     return path
 
 
 def run_of(path: Path) -> str:
-    """Name of the recorded run that a shipped file comes from."""
+    """Name of the recorded run of a shipped file."""
     with safe_open(path, framework="pt") as file:
         return json.loads(file.metadata()["zerobev"])["run"]
 
 
 def shipped_runs() -> dict[str, str]:
-    """Name of the recorded run that each shipped file comes from."""
+    """Name of the recorded run of each shipped file."""
     return {name: run_of(shipped(name)) for name in (*ROWS, DEPTH)}

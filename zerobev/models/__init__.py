@@ -1,4 +1,4 @@
-"""The networks: from a photograph and zero-shot images to maps."""
+"""The networks: from an RGB image and zero-shot images to maps."""
 
 from zerobev.models.base import BevModel, MapLogits
 from zerobev.models.tim import TIM

@@ -1,7 +1,7 @@
-"""Feature extractors on the first-person side: the ResNet of the photograph and the small CNN of the zero-shot image.
+"""Feature extractors on the first-person side: the ResNet of the RGB image and the small CNN of the zero-shot image.
 
-Paper, supplement, "Feature extractor": four maps of each image, at the same four strides, so that they can be
-concatenated. Every layer halves a size n to ceil(n / 2), so odd sizes work and both extractors agree.
+Paper, supplement, "Feature extractor". Both give four maps per image at the same four strides, to be concatenated.
+Every layer reduces a size n to ceil(n / 2), so both extractors agree at odd sizes, too.
 """
 
 from itertools import pairwise
@@ -26,11 +26,11 @@ def resnet(
     block: str = "basic",
     max_pool: bool = True,
 ) -> ResNetBackbone:
-    """A ResNet with random weights whose call gives one map a stage (`.feature_maps`, finest first).
+    """A ResNet with random weights; its output has one map per stage (`.feature_maps`, finest first).
 
-    The stem is a 7x7 convolution with stride 2; with `max_pool` a 3x3 max-pool halves the map again. The first
-    stage keeps the size, each later one halves it. Parameter names are those of the `transformers` library, so
-    that `microsoft/resnet-50` fits the paper's setting.
+    The stem is a 7x7 convolution with stride 2; with `max_pool` a 3x3 max-pool halves the map again. The first stage
+    keeps the size, each later stage halves it. Parameter names are those of the `transformers` library, so the weights
+    of `microsoft/resnet-50` fit at the paper's scale.
     """
     config = ResNetConfig(
         num_channels=in_channels,
@@ -47,7 +47,7 @@ def resnet(
 
 
 class RgbEncoder(nn.Module):
-    """The ResNet of the photograph, normalised as ImageNet is; maps at strides `model.stem_stride` * (1, 2, 4, 8).
+    """ResNet of the RGB image, normalised as in ImageNet; maps at strides `model.stem_stride` * (1, 2, 4, 8).
 
     Raises `InputError` for a stem stride other than 2 and 4.
     """
@@ -63,7 +63,7 @@ class RgbEncoder(nn.Module):
         self.network = resnet(3, model.stem_channels, model.channels, model.depths, model.block, max_pool)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
-        # all maps follow, which saves a fifth of a step on a CPU; torch's stub lacks the argument
+        # all maps then have this layout, which saves a fifth of a step on a CPU; torch's stub lacks the argument
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, rgb: Tensor) -> tuple[Tensor, ...]:
@@ -72,14 +72,16 @@ class RgbEncoder(nn.Module):
 
 
 class ZeroCNN(nn.Module):
-    """Bring the zero-shot image to the sizes of the backbone's maps: four 3x3 convolutions of stride 2, with ReLU.
+    """Zero-shot image at the sizes of the backbone's maps: four 3x3 convolutions of stride 2, with ReLU.
 
     At stem stride 2 this is the network of the paper's supplement, with maps at strides 2, 4, 8, 16. The paper also
-    states backbone maps at strides 4 to 32, which four such layers cannot reach; at stem stride 4 the image is
-    therefore first folded, 2 x 2 pixels into 4 channels, which halves its size and loses nothing.
+    states backbone maps at strides 4 to 32, out of reach for four such layers. At stem stride 4 the image is therefore
+    first folded, 2 x 2 pixels into 4 channels, which halves its size without loss.
 
-    There is no normalisation: the scale of the input means something, and an empty image is a usual one. `gain` scales
-    the first weights, and with them all maps: beside the features of a photograph those of a sparse image are faint.
+    There is no normalisation: the scale of the input carries information, and empty images are common.
+
+    gain: factor on the initial weights of the first layer, and thereby on all maps; the features of a sparse image are
+        small beside those of the RGB image
     """
 
     def __init__(self, channels: tuple[int, ...], stem_stride: int, in_channels: int = 1, gain: float = 1.0):

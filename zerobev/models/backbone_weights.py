@@ -1,4 +1,4 @@
-"""Weights from elsewhere for the RGB backbone: ImageNet's as in the paper, or those of our own depth pretraining."""
+"""Pretrained weights for the RGB backbone: from ImageNet as in the paper, or from our own depth pretraining."""
 
 import pickle
 import re
@@ -11,15 +11,14 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import ResNetModel
 
-from zerobev.common.errors import InputError
+from zerobev.common.errors import InputError, first_line
 from zerobev.models.backbone import RgbEncoder
 
 Weights = Mapping[str, Tensor]
 
-#: What a checkpoint holds beside the backbone: torchvision's and ours.
-_CLASSIFIER = re.compile(r"fc\.(weight|bias)")
-_PREFIX = "backbone.network."
-#: A counter that older files lack and that a batch norm with a momentum does not read.
+_CLASSIFIER = re.compile(r"fc\.(weight|bias)")  # of torchvision, beside the backbone
+_PREFIX = "backbone.network."  # of the backbone in our checkpoints
+#: Missing in older files; batch norms with a momentum do not use it.
 _COUNTER = "num_batches_tracked"
 _STAGE = re.compile(r"encoder\.stages\.(\d+)\.|layer(\d+)\.")
 _BLOCK = re.compile(
@@ -32,11 +31,12 @@ def load_backbone(backbone: RgbEncoder, source: str | Path) -> None:
 
     source: one of
         `*.pth`: a state dict of a torchvision ResNet (only tensors are unpickled);
-        `*.safetensors`: a checkpoint of one of our networks, of which the backbone is taken, such as a `DepthNet`'s;
+        `*.safetensors`: a checkpoint of one of our networks, for example a `DepthNet`; only its backbone is read;
         a folder, or a name on the Hugging Face hub such as `microsoft/resnet-50`: a ResNet of `transformers`.
+        Stages beyond those of `backbone` are ignored.
 
-    Raises `InputError` where `source` cannot be read, or lacks a weight of the backbone, has one of another shape, or
-    has one more in a stage of the backbone; `backbone` is then as it was. A source with more stages gives its first.
+    Raises `InputError`, with `backbone` unchanged, if `source` cannot be read, lacks a weight of the backbone, has a
+    weight of another shape, or has additional weights in a stage of the backbone.
     """
     weights, named = _read(source)
     network = backbone.network
@@ -55,7 +55,7 @@ def load_backbone(backbone: RgbEncoder, source: str | Path) -> None:
 
 
 def torchvision_name(name: str) -> str:
-    """What torchvision calls a parameter or buffer of a `transformers` ResNet.
+    """torchvision's name of a parameter or buffer of a `transformers` ResNet.
 
     Both count blocks from 0; torchvision counts stages and the convolutions of a block from 1.
     """
@@ -74,7 +74,7 @@ def torchvision_name(name: str) -> str:
 
 
 def _stage(name: str) -> int:
-    """The stage, from 0, that a weight belongs to in either naming; -1 for the stem and whatever is no weight."""
+    """Stage of a weight, from 0, in either naming; -1 for the stem and for other names."""
     found = _STAGE.search(name)
     if found is None:
         return -1
@@ -83,7 +83,7 @@ def _stage(name: str) -> int:
 
 
 def _read(source: str | Path) -> tuple[Weights, Callable[[str], str]]:
-    """The backbone's weights under the names of the file, and our name -> the file's."""
+    """Weights of the backbone by their names in the file, and the function our name -> name in the file."""
     suffix = Path(source).suffix
     if suffix == ".pth":
         weights, named = _torchvision(Path(source)), torchvision_name
@@ -98,7 +98,7 @@ def _torchvision(path: Path) -> Weights:
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
-        raise InputError(f"{path}: expected a state dict of a ResNet, found: {_first_line(error)}") from error
+        raise InputError(f"{path}: expected a state dict of a ResNet, found: {first_line(error)}") from error
     if not isinstance(weights, Mapping) or not all(isinstance(tensor, Tensor) for tensor in weights.values()):
         raise InputError(f"{path}: expected a state dict, names and tensors, found another {type(weights).__name__}")
     return {name: tensor for name, tensor in weights.items() if not _CLASSIFIER.fullmatch(name)}
@@ -108,7 +108,7 @@ def _checkpoint(path: Path) -> Weights:
     try:
         weights = load_file(path)
     except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: expected a safetensors checkpoint, found: {_first_line(error)}") from error
+        raise InputError(f"{path}: expected a safetensors checkpoint, found: {first_line(error)}") from error
     return {name: tensor for name, tensor in weights.items() if name.startswith(_PREFIX)}
 
 
@@ -116,13 +116,9 @@ def _transformers(source: str | Path) -> Weights:
     try:
         network, report = ResNetModel.from_pretrained(str(source), output_loading_info=True)
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
-        raise InputError(f"{source}: expected a ResNet of transformers, found: {_first_line(error)}") from error
-    # weights that the library does not find stay random, with a warning alone
+        raise InputError(f"{source}: expected a ResNet of transformers, found: {first_line(error)}") from error
+    # the library only warns of missing weights and leaves them random
     missing = sorted(name for name in report["missing_keys"] if not name.endswith(_COUNTER))
     if missing:
         raise InputError(f"{source}: expected the weight {missing[0]}, found none of this name")
     return network.state_dict()
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

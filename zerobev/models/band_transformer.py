@@ -2,9 +2,8 @@
 
 Paper, Eqs. 3 and 4, and supplement, "FPV to BEV transformers".
 
-Columns are independent of each other, so they are the batch: N = B * C sequences of R image rows become N sequences
-of P ray positions. The sequences are short, so attention is two plain matrix products; its weights exist anyway and
-are returned.
+Columns are independent of each other and form the batch: N = B * C sequences of R image rows become N sequences of P
+ray positions. The sequences are short, so attention is two plain matrix products, and its weights are returned.
 """
 
 from typing import NamedTuple
@@ -13,8 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-#: How much larger positions are, and weights of queries and keys, where rays start at the ground.
-_GROUND_POSITION, _GROUND_WEIGHT = 6.0, 1.5
+#: Initial factors for rays that start at the floor: on position encodings, and on weights of queries and keys.
+_FLOOR_POSITION, _FLOOR_WEIGHT = 6.0, 1.5
 
 
 def sinusoids(positions: Tensor, width: int) -> Tensor:
@@ -25,7 +24,7 @@ def sinusoids(positions: Tensor, width: int) -> Tensor:
 
 
 class BandAttention(NamedTuple):
-    """Attention weights of a band, one tensor a layer; each sums to 1 over its last axis (alpha of the paper's Eq. 3).
+    """Attention weights of a band, one tensor per layer; sums over the last axis are 1 (alpha in the paper's Eq. 3).
 
     Ray self-attention of the first layer is the same for every column, so its N is 1.
     """
@@ -36,10 +35,10 @@ class BandAttention(NamedTuple):
 
 
 class MultiHeadAttention(nn.Module):
-    """Scaled dot-product attention with several heads; positions go to queries and keys, not to values.
+    """Scaled dot-product attention with several heads; positions are added to queries and keys, not to values.
 
-    `inputs` holds the three input projections one below the other. They are linear, so the position's share is added
-    behind them: it is computed once and not for each column, and queries, keys and values are one matrix product.
+    `inputs` stacks the three input projections, so queries, keys and values are one matrix product. They are linear:
+    projected positions are added to their output, and are thus computed once for all columns.
     """
 
     def __init__(self, width: int, heads: int):
@@ -50,22 +49,22 @@ class MultiHeadAttention(nn.Module):
 
     @torch.no_grad()
     def start_equal(self, weight: float) -> None:
-        """Give queries and keys one weight matrix, `weight` times the identity: like positions then attract."""
+        """Set the weight matrices of queries and keys to `weight` times the identity: equal positions then attract."""
         queries, keys, _ = self.inputs.weight.chunk(3)
         nn.init.eye_(queries).mul_(weight)
         keys.copy_(queries)
 
     def qkv(self, x: Tensor, position: Tensor, first: int, last: int) -> tuple[Tensor, ...]:
-        """Of (queries, keys, values) those from `first` to `last`: x (N, L, d) -> each (N, heads, L, d / heads)."""
+        """`(queries, keys, values)[first:last]` of x (N, L, d) at position (L, d): each (N, heads, L, d / heads)."""
         rows = slice(first * self.width, last * self.width)
         weight, bias = self.inputs.weight[rows], self.inputs.bias[rows]
-        placed = (min(last, 2) - first) * self.width
-        shift = F.pad(F.linear(position, weight[:placed]), (0, len(weight) - placed))
+        with_position = (min(last, 2) - first) * self.width
+        shift = F.pad(F.linear(position, weight[:with_position]), (0, len(weight) - with_position))
         projected = F.linear(x, weight, bias) + shift
         return projected.unflatten(-1, (last - first, self.heads, -1)).permute(2, 0, 3, 1, 4).contiguous().unbind()
 
     def mix(self, queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """The paper's Eqs. 3 and 4 in every head -> (N, P, d), attention (N, heads, P, R)."""
+        """The paper's Eqs. 3 and 4 per head -> (N, P, d), attention (N, heads, P, R)."""
         attention = (queries * queries.shape[-1] ** -0.5 @ keys.transpose(-1, -2)).softmax(-1)
         return self.out((attention @ values).transpose(1, 2).flatten(2)), attention
 
@@ -86,7 +85,7 @@ class FeedForward(nn.Sequential):
 
 
 class EncoderLayer(nn.Module):
-    """Post-norm layer of the column encoder: self-attention, feed-forward, each added to its input and normalised."""
+    """Post-norm layer of the column encoder: self-attention and feed-forward, each with a skip and a LayerNorm."""
 
     def __init__(self, width: int, heads: int, hidden: int, dropout: float):
         super().__init__()
@@ -105,7 +104,7 @@ class EncoderLayer(nn.Module):
 class DecoderLayer(nn.Module):
     """Post-norm layer of the ray decoder: ray self-attention, cross-attention to the column, feed-forward.
 
-    The supplement lists two norms and sums tensors of unlike width; this is the standard layer, with three.
+    The supplement lists two norms and adds tensors of different widths; this is the standard layer, with three norms.
     """
 
     def __init__(self, width: int, heads: int, hidden: int, dropout: float):
@@ -130,13 +129,13 @@ class DecoderLayer(nn.Module):
 class BandTransformer(nn.Module):
     """Column encoder and ray decoder of one band: columns of `rows` pixels to rays of `positions` cells.
 
-    A ray starts as a trained embedding of its positions, the same for every column; until it meets a column in the
-    first cross-attention it is therefore computed once, not N times.
+    A ray starts as a trained embedding of its positions, the same for every column. It is therefore computed once, not
+    N times, before the first cross-attention.
 
-    floor_rows: (positions,) the row of the column that sees the floor at each position. If it is given, training starts
-    from the projection of a flat floor: a position of the ray is encoded as that row is, queries and keys start with
-    equal weights, and so each position looks at the row where it would be if all were floor. Short trainings need
-    that: as long as the attention is diffuse, the Dice loss has its minimum at an all-white map.
+    floor_rows: (positions,) image row of the floor at each position. If given, training starts from the projection of a
+        flat floor: each ray position has the encoding of its row, and queries and keys have equal weights, so that each
+        position attends to its row. Short trainings need this: with diffuse attention, the Dice loss has its minimum at
+        an all-white map.
     """
 
     position: Tensor  #: (rows, width)
@@ -158,20 +157,19 @@ class BandTransformer(nn.Module):
         decoder = [DecoderLayer(width, heads, hidden, dropout) for _ in range(layers)]
         self.decoder = nn.ModuleList(decoder)
         self.ray = nn.Parameter(torch.empty(positions, width))
-        ground = floor_rows is not None
-        gain = _GROUND_POSITION if ground else 1.0
-        seen_at = torch.arange(positions) if floor_rows is None else floor_rows
+        gain = 1.0 if floor_rows is None else _FLOOR_POSITION
+        ray_rows = torch.arange(positions) if floor_rows is None else floor_rows
         self.register_buffer("position", gain * sinusoids(torch.arange(rows), width), persistent=False)
-        self.register_buffer("ray_position", gain * sinusoids(seen_at, width), persistent=False)
+        self.register_buffer("ray_position", gain * sinusoids(ray_rows, width), persistent=False)
         for parameter in self.parameters():
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
-        if ground:
+        if floor_rows is not None:
             nn.init.zeros_(self.ray)
             for layer in decoder:
-                layer.cross_attention.start_equal(_GROUND_WEIGHT)
+                layer.cross_attention.start_equal(_FLOOR_WEIGHT)
 
-    def attend(self, columns: Tensor) -> tuple[Tensor, BandAttention]:
+    def forward(self, columns: Tensor) -> tuple[Tensor, BandAttention]:
         """Columns (N, R, d), top row first -> rays (N, P, d), and all attention weights."""
         attention = BandAttention([], [], [])
         for layer in self.encoder:
@@ -183,7 +181,3 @@ class BandTransformer(nn.Module):
             attention.rays.append(ray_weights)
             attention.cross.append(cross_weights)
         return rays, attention
-
-    def forward(self, columns: Tensor) -> Tensor:
-        """Columns (N, R, d), top row first -> rays (N, P, d)."""
-        return self.attend(columns)[0]

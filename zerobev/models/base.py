@@ -1,6 +1,6 @@
-"""What every network has in common: its configuration, its checkpoint, and what those that predict maps return.
+"""Common base of all networks: configuration, checkpoint, and output.
 
-A network is described wholly by its class, a camera and a `ModelConfig`; a checkpoint holds all three and the weights.
+A checkpoint holds the class of a network, its camera, its `ModelConfig` and its weights, and needs nothing else.
 """
 
 import json
@@ -17,28 +17,28 @@ from zerobev.common.storage import replacing
 from zerobev.config import AUX, CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder
 
-#: Zero-shot images that pass a network together, at most (a batch with more samples passes whole).
+#: Maximum number of zero-shot images per forward pass; larger batches still pass whole.
 IMAGES_PER_PASS = 16
 
 
 class MapLogits(NamedTuple):
-    """What a network predicts, before the FOV mask."""
+    """Output of a network, before the FOV mask."""
 
-    zero_logits: Tensor  #: (B, K, M, M): one map a zero-shot image, or one a class
-    aux_logits: Tensor | None  #: (B, len(aux), M, M), or None where the network has no auxiliary output
-    pooled: Tensor | None = None  #: (B, K, M, M) in [0, 1]: the maps before the U-Net, of a network that has them
+    zero_logits: Tensor  #: (B, K, M, M): one map per zero-shot image or per class
+    aux_logits: Tensor | None  #: (B, len(aux), M, M); None without auxiliary output
+    pooled: Tensor | None = None  #: (B, K, M, M) in [0, 1]: maps before the U-Net; only of `MaxPoolZeroBEV`
 
 
 class BevModel(nn.Module):
     """A network with its configuration.
 
-    Those that predict maps are called as `model(rgb, zero, depth)` and return a `MapLogits`; each reads what it needs
-    of rgb (B, 3, H, W) in [0, 1], zero (B, K, H, W) and depth (B, 1, H, W) in metres, all float32.
+    Networks that predict maps are called as `model(rgb, zero, depth)` and return a `MapLogits`. Inputs, not all used by
+    every network: rgb (B, 3, H, W) in [0, 1], zero (B, K, H, W), depth (B, 1, H, W) in metres, all float32.
 
-    Raises `InputError` for auxiliary maps that do not exist.
+    Raises `InputError` for unknown auxiliary maps.
     """
 
-    backbone: RgbEncoder  #: every network has one
+    backbone: RgbEncoder
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
         super().__init__()
@@ -47,11 +47,11 @@ class BevModel(nn.Module):
         self.camera, self.config = camera, model
 
     def check(self, **images: tuple[Tensor | None, int | None]) -> int:
-        """The batch size, once every image has the camera's size and its number of channels (None: any number).
+        """Check images against the camera's size and their numbers of channels (None: any); returns the batch size.
 
-        Raises `InputError` that names the first image that does not.
+        Raises `InputError` for the first image of another shape.
         """
-        side, batch = self.camera.fpv_px, 0  # 0: not known yet
+        side, batch = self.camera.fpv_px, 0  # 0: unknown
         for name, (image, channels) in images.items():
             found = None if image is None else tuple(image.shape)
             if found is not None and len(found) == 4:
@@ -64,12 +64,12 @@ class BevModel(nn.Module):
         return batch
 
     def check_inputs(self, rgb: Tensor, zero: Tensor, depth: Tensor | None) -> None:
-        """`check` of what a zero-shot network is called with; depth counts in the residual variants alone."""
+        """`check` for the inputs of a zero-shot network; depth is checked only in residual variants."""
         read = {"depth": (depth, 1)} if self.config.residual else {}
         self.check(rgb=(rgb, 3), zero=(zero, None), **read)
 
     def save(self, path: Path) -> None:
-        """Write one safetensors file: the weights, with the class and configuration as JSON in its metadata."""
+        """Write one safetensors file: the weights, with class and configuration as JSON in its metadata."""
         described = {"class": type(self).__name__, "camera": asdict(self.camera), "model": asdict(self.config)}
         tensors = {name: tensor.contiguous() for name, tensor in self.state_dict().items()}
         with replacing(path) as temporary:
@@ -77,10 +77,10 @@ class BevModel(nn.Module):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """The network saved in `path`, on the CPU, in evaluation mode; nothing else is needed.
+        """The network saved in `path`, on the CPU, in evaluation mode.
 
-        Raises `InputError` where the file cannot be read, is not a checkpoint of this class, or does not hold exactly
-        the weights of its own configuration.
+        Raises `InputError` if the file cannot be read, is not a checkpoint of this class, or does not hold exactly the
+        weights of its configuration.
         """
         described = description(path)
         if described["class"] != cls.__name__:
@@ -89,7 +89,7 @@ class BevModel(nn.Module):
             camera = CameraConfig(**described["camera"])
             fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in described["model"].items()}
             network = cls(camera, ModelConfig(**fields))
-        except Exception as error:  # sizes that are none let every layer fail in its own way
+        except Exception as error:  # impossible sizes raise many kinds of error in the layers
             found = f"{type(error).__name__}: {error}"
             raise InputError(f"{path}: expected the network's configuration in the metadata, found: {found}") from error
         try:
@@ -101,9 +101,9 @@ class BevModel(nn.Module):
 
 
 def description(path: Path) -> dict[str, Any]:
-    """What a checkpoint says of its network: `class` (its name), `camera` and `model` (fields and values).
+    """Metadata of a checkpoint: `class` (its name), `camera` and `model` (fields and values).
 
-    Raises `InputError` where the file cannot be read or says nothing.
+    Raises `InputError` if the file cannot be read or has no such metadata.
     """
     try:
         with safe_open(path, framework="pt") as file:

@@ -1,4 +1,6 @@
-"""The U-Net on the map, which sees across rays (paper, supplement, "U-Net/BEV decoder"; Philion and Fidler 2020)."""
+"""The U-Net on the map, across rays (paper, supplement, "U-Net/BEV decoder"; Philion and Fidler 2020)."""
+
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -8,22 +10,22 @@ from zerobev.models.backbone import resnet
 
 
 def convolution(in_channels: int, out_channels: int) -> nn.Sequential:
-    """3x3 convolution, batch norm, ReLU; the size stays."""
+    """3x3 convolution, batch norm, ReLU; the size is kept."""
     return nn.Sequential(
         nn.Conv2d(in_channels, out_channels, 3, padding=1, bias=False), nn.BatchNorm2d(out_channels), nn.ReLU()
     )
 
 
-def upsample(features: Tensor, like: Tensor) -> Tensor:
-    """Bilinear, to the size of `like`, which need not be a multiple."""
-    return F.interpolate(features, size=like.shape[-2:], mode="bilinear", align_corners=False)
+def resize(images: Tensor, size: Sequence[int]) -> Tensor:
+    """Images (N, C, h, w) resampled to `size` (H, W), bilinear, with the same image edges."""
+    return F.interpolate(images, size=tuple(size), mode="bilinear", align_corners=False)
 
 
 class BevDecoder(nn.Module):
     """7x7 stride-2 stem without max-pool, three ResNet-18 stages, and two steps up, as in Lift-Splat-Shoot.
 
-    The first step brings the coarsest map to the size of the first stage's and concatenates the two. The second one
-    goes to full size; there the input itself is added, so that no resolution is without its skip.
+    The first step resizes the coarsest map to the size of the first stage's map and concatenates the two. The second
+    step resizes to full size and adds the input, so every resolution has a skip.
     """
 
     def __init__(self, width: int, channels: tuple[int, int, int], out_channels: int):
@@ -36,5 +38,5 @@ class BevDecoder(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Map features (N, width, M, M) -> logits (N, out_channels, M, M)."""
         fine, _, coarse = self.encoder(features).feature_maps
-        merged = self.up(torch.cat([upsample(coarse, fine), fine], dim=1))
-        return self.head(self.full(upsample(merged, features) + features))
+        merged = self.up(torch.cat([resize(coarse, fine.shape[-2:]), fine], dim=1))
+        return self.head(self.full(resize(merged, features.shape[-2:]) + features))

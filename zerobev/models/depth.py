@@ -1,8 +1,8 @@
-"""Metric depth from one photograph: our own small network, and metric depth models of the `transformers` library.
+"""Metric depth from one image: our own small network, and metric depth models of the `transformers` library.
 
 The paper estimates depth with a DPT of 123 M parameters, fine-tuned to metres (supplement, "Finetuning monocular depth
-estimation"). Our own network is one of this project's RGB backbones with a light decoder, so that training it also
-pretrains the backbone of every other network.
+estimation"). Our own network has the RGB backbone of the other networks and a light decoder, so its training also
+pretrains their backbone.
 """
 
 from collections.abc import Iterable
@@ -13,25 +13,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from zerobev.common.errors import InputError
+from zerobev.common.errors import InputError, first_line
 from zerobev.config import CameraConfig, ModelConfig
 from zerobev.geometry.cameras import fpv_rays
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
 from zerobev.models.base import BevModel
-from zerobev.models.decoder import convolution, upsample
+from zerobev.models.decoder import convolution, resize
 
 if TYPE_CHECKING:
     from transformers import PreTrainedConfig, PreTrainedModel
 
-#: Nothing that `DepthNet` predicts is farther than this, metres.
+#: Maximum depth that `DepthNet` predicts, metres.
 FARTHEST_M = 50.0
 
 
 class DepthEstimator(Protocol):
     """A module that estimates depth, called as `estimator(rgb)`.
 
-    One that takes any size may have an attribute `side_px`, the side of the square images that it is at home with.
-    `Projector` then gives it the photograph in up to so many pixels, rather than in those of the network's camera.
+    Optional attribute `side_px`: the preferred side of the square input image, if any size is accepted. `Projector`
+    then resamples the photograph to up to that size instead of the size of the network's camera.
     """
 
     def __call__(self, rgb: Tensor) -> Tensor:
@@ -47,9 +47,9 @@ class DepthEstimator(Protocol):
 class DepthNet(BevModel):
     """Backbone, top-down decoder, and one inverse depth per pixel; for images of the given camera.
 
-    A plane's inverse depth is affine in image coordinates, which a convolution extrapolates well: floor, walls and
-    ceiling are planes. The direction of each ray is an input of the decoder, because the distance of the floor follows
-    from the image row only for a known camera.
+    Floor, walls and ceiling are planes; the inverse depth of a plane is affine in image coordinates, which convolutions
+    extrapolate well. Ray directions are an input of the decoder, because the distance of the floor follows from the
+    image row only for a known camera.
     """
 
     rays: Tensor  #: (1, 2, H, W)
@@ -59,7 +59,7 @@ class DepthNet(BevModel):
         self.backbone = RgbEncoder(model)
         self.laterals = nn.ModuleList(nn.Conv2d(channels + 2, model.width, 1) for channels in model.channels)
         self.merges = nn.ModuleList(convolution(model.width, model.width) for _ in model.channels)
-        self.head = nn.Conv2d(model.width, model.stem_stride**2, 1)  # one per pixel under a cell of the finest map
+        self.head = nn.Conv2d(model.width, model.stem_stride**2, 1)  # one channel per pixel under a finest feature
         rays = torch.from_numpy(fpv_rays(camera)[..., :2]).float().permute(2, 0, 1)[None]
         self.register_buffer("rays", rays, persistent=False)
 
@@ -70,18 +70,19 @@ class DepthNet(BevModel):
         merged: Tensor | None = None
         for features, lateral, merge in reversed(list(zip(maps, self.laterals, self.merges))):
             rays = F.adaptive_avg_pool2d(self.rays, features.shape[-2:]).expand(len(rgb), -1, -1, -1)
-            own = lateral(torch.cat([features, rays.to(features.dtype)], dim=1))
-            merged = merge(own if merged is None else own + upsample(merged, own))
-        fine = F.pixel_shuffle(self.head(merged), self.config.stem_stride)[..., : rgb.shape[-2], : rgb.shape[-1]]
-        return 1 / (F.softplus(fine.float()) + 1 / FARTHEST_M)
+            fine = lateral(torch.cat([features, rays.to(features.dtype)], dim=1))
+            merged = merge(fine if merged is None else fine + resize(merged, fine.shape[-2:]))
+        pixels = F.pixel_shuffle(self.head(merged), self.config.stem_stride)[..., : rgb.shape[-2], : rgb.shape[-1]]
+        return 1 / (F.softplus(pixels.float()) + 1 / FARTHEST_M)
 
 
-_IMAGENET = (tuple(IMAGENET_MEAN), tuple(IMAGENET_STD))
+_MetricType = tuple[int | None, tuple[tuple[float, ...], tuple[float, ...]]]
+_IMAGENET = (IMAGENET_MEAN, IMAGENET_STD)
 _HALVES = ((0.5,) * 3, (0.5,) * 3)
 _NONE = ((0.0,) * 3, (1.0,) * 3)
-#: Types of the transformers library that predict metres: side of a square input as in their training (None: as
-#: configured), and mean and standard deviation of their input, where no image processor says otherwise.
-METRIC_TYPES: dict[str, tuple[int | None, tuple[tuple[float, ...], tuple[float, ...]]]] = {
+#: Types of the transformers library that predict metres: side of their square training images (None: as configured),
+#: and mean and standard deviation of their input, unless set by an image processor.
+METRIC_TYPES: dict[str, _MetricType] = {
     "depth_anything": (None, _IMAGENET),
     "dpt": (None, _IMAGENET),
     "glpn": (480, _NONE),
@@ -97,8 +98,8 @@ _REFUSED = {
 class HubDepth(nn.Module):
     """A metric depth model of the `transformers` library as a `DepthEstimator`.
 
-    Photographs are resized (bilinear) to the size that the network was trained for and normalised; the depth is resized
-    back. `side_px` tells a caller that has the photograph in more pixels how many are of use.
+    Images are resized (bilinear) to the side of the training images, `side_px`, and normalised; the depth is resized
+    back.
     """
 
     mean: Tensor  #: (3, 1, 1)
@@ -110,17 +111,14 @@ class HubDepth(nn.Module):
         mean: Iterable[float] | None = None,
         std: Iterable[float] | None = None,
     ):
-        """Wrap a network, to fine-tune it for example; `from_pretrained` checks that one predicts metres.
+        """Wrap a network, for example to fine-tune it; only `from_pretrained` checks that it predicts metres.
 
-        network: of a type in `METRIC_TYPES`; returns `predicted_depth`, in metres once it is used
+        network: of a type in `METRIC_TYPES`; returns `predicted_depth`
         mean, std: of its RGB input; default: the type's
         Raises `InputError` for another type.
         """
         super().__init__()
-        kind = network.config.model_type
-        if kind not in METRIC_TYPES:
-            raise InputError(f"network: {_expected_types()}, found {kind}{_reason(kind)}")
-        side, defaults = METRIC_TYPES[kind]
+        side, defaults = _metric_type(network.config, "network")
         self.network = network
         self.side_px = side or _configured_side(network.config)
         for name, given, default in zip(("mean", "std"), (mean, std), defaults):
@@ -130,13 +128,13 @@ class HubDepth(nn.Module):
     def from_pretrained(cls, source: str | Path, predicts_metres: bool = False) -> Self:
         """The depth model in a folder or under a name on the Hugging Face hub, in evaluation mode.
 
-        predicts_metres: your word that a DPT does, after fine-tuning (`zerobev.training.depth`); as published it
-            predicts relative inverse depth, and its files are the same. The other types state it.
-        The image normalisation is that of the image processor beside it, if there is one, else the type's.
-        Raises `InputError` where there is no depth model, for a type that is not in `METRIC_TYPES`, for a Depth
-        Anything of relative depth, and for a DPT without `predicts_metres`.
+        predicts_metres: confirms that a DPT was fine-tuned to metres (`zerobev.training.depth`). Published DPTs predict
+            relative inverse depth, and their files do not differ. Not needed for other types.
+        The image normalisation is that of the image processor, if there is one, else the type's.
+        Raises `InputError` if there is no depth model, for a type outside `METRIC_TYPES`, for a Depth Anything of
+        relative depth, and for a DPT without `predicts_metres`.
         """
-        # imported here: it takes seconds, and most projections need no such model
+        # slow to import, and rarely needed
         from transformers import AutoConfig, AutoModelForDepthEstimation
         from transformers.image_processing_base import ImageProcessingMixin
         from transformers.utils import IMAGE_PROCESSOR_NAME, cached_file
@@ -149,8 +147,7 @@ class HubDepth(nn.Module):
         except InputError:
             raise
         except (OSError, ValueError, RuntimeError) as error:
-            found = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            raise InputError(f"{source}: expected a depth model of transformers, found: {found}") from error
+            raise InputError(f"{source}: expected a depth model of transformers, found: {first_line(error)}") from error
         if report["missing_keys"]:
             raise InputError(f"{source}: expected the weight {min(report['missing_keys'])}, found none of this name")
         if settings.get("do_normalize") is False:
@@ -159,38 +156,31 @@ class HubDepth(nn.Module):
 
     def forward(self, rgb: Tensor) -> Tensor:
         """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres."""
-        resized = _resized(rgb, (self.side_px, self.side_px))
-        # never with `labels`: most of these networks compute no loss, and raise
+        resized = resize(rgb, (self.side_px, self.side_px))
+        # without `labels`: most of these networks compute no loss and would raise
         depth = self.network(pixel_values=(resized - self.mean) / self.std).predicted_depth
-        return _resized(depth[:, None].float(), rgb.shape[-2:])
+        return resize(depth[:, None].float(), rgb.shape[-2:])
+
+
+def _metric_type(config: "PreTrainedConfig", name: str) -> _MetricType:
+    """The entry of `METRIC_TYPES` for a configuration; `name` is for the `InputError` of another type."""
+    kind = config.model_type
+    if kind not in METRIC_TYPES:
+        reason = f", which predicts {_REFUSED[kind]}" if kind in _REFUSED else ""
+        raise InputError(f"{name}: expected a model of metric depth ({', '.join(METRIC_TYPES)}), found {kind}{reason}")
+    return METRIC_TYPES[kind]
 
 
 def _check_metric(config: "PreTrainedConfig", source: str, predicts_metres: bool) -> None:
-    kind = config.model_type
-    if kind not in METRIC_TYPES:
-        raise InputError(f"{source}: {_expected_types()}, found {kind}{_reason(kind)}")
+    _metric_type(config, source)
     if (predicted := getattr(config, "depth_estimation_type", "metric")) != "metric":
         raise InputError(f"{source}: expected a model of metric depth, found one of {predicted} depth")
-    if kind == "dpt" and not predicts_metres:
-        choice = "say predicts_metres=True where it was fine-tuned to metres"
+    if config.model_type == "dpt" and not predicts_metres:
+        choice = "pass predicts_metres=True if it was fine-tuned to metres"
         raise InputError(f"{source}: expected a model of metric depth, found a DPT, relative as published: {choice}")
 
 
-def _expected_types() -> str:
-    return f"expected a model of metric depth ({', '.join(METRIC_TYPES)})"
-
-
-def _reason(kind: str) -> str:
-    return f", which predicts {_REFUSED[kind]}" if kind in _REFUSED else ""
-
-
 def _configured_side(config: "PreTrainedConfig") -> int:
-    """Side of the square images that a network was trained for: of its backbone, in pixels."""
+    """Side of the square training images of a network, or of its backbone, pixels."""
     size = getattr(getattr(config, "backbone_config", None), "image_size", None) or config.image_size
     return size if isinstance(size, int) else min(size)
-
-
-def _resized(images: Tensor, size: tuple[int, ...]) -> Tensor:
-    if tuple(images.shape[-2:]) == tuple(size):
-        return images
-    return F.interpolate(images, size=size, mode="bilinear", align_corners=False)

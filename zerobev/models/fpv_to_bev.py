@@ -1,10 +1,9 @@
-"""From image features to map features: a transformer and a resampling a depth band.
+"""From image features to map features: a transformer and a resampling per depth band.
 
-Paper, supplement, "FPV to BEV transformers". The finest map feeds the farthest band.
+Paper, supplement, "FPV to BEV transformers". The finest map is the input of the farthest band.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import cast
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +17,8 @@ from zerobev.models.polar import PolarToCartesian, band_rows, floor_row
 class FpvToBev(nn.Module):
     """Four pyramid maps to one map of BEV features, bands stacked far to near.
 
-    `bands` and `resamplers` are near band first, as the configuration is. Raises `InputError` unless there are as many
-    bands as maps.
+    `bands` and `resamplers` are near band first, as in the configuration. Raises `InputError` if the numbers of bands
+    and maps differ.
     """
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
@@ -45,7 +44,7 @@ class FpvToBev(nn.Module):
 
     @property
     def valid(self) -> Tensor:
-        """(M, M) bool: the cells that an image column sees."""
+        """(M, M) bool: the cells inside the image columns' field of view."""
         return torch.cat([resampler.get_buffer("valid") for resampler in reversed(self.resamplers)])
 
     def forward(self, maps: Sequence[Tensor]) -> tuple[Tensor, list[BandAttention]]:
@@ -54,8 +53,7 @@ class FpvToBev(nn.Module):
         Features are zero outside `valid`. Attention is near band first; the batch of its tensors is N * C, image column
         fastest.
         """
-        bands = cast(Iterable[BandTransformer], self.bands)  # torch's lists do not say what they hold
-        rays, attention = zip(*(band.attend(columns(m)) for band, m in zip(bands, reversed(maps))))
+        rays, attention = zip(*(band(columns(m)) for band, m in zip(self.bands, reversed(maps))))
         return self.to_map([r.unflatten(0, (len(maps[0]), -1)) for r in rays]), list(attention)
 
     def to_map(self, rays: Sequence[Tensor]) -> Tensor:
@@ -67,10 +65,10 @@ class FpvToBev(nn.Module):
 def reweigh(cross: Tensor, values: Tensor) -> Tensor:
     """Cross-attention with identity values (paper, Eq. 8): image columns summed with the weights of another stream.
 
-    Of the channels each head carries its share, as in any attention of several heads.
+    The channels are divided among the heads, as in other multi-head attention.
 
-    cross: (B * C, heads, P, R) attention of B photographs, image column fastest
-    values: (B * K, d, R, C) maps of K images to each photograph
+    cross: (B * C, heads, P, R) attention of B RGB images, image column fastest
+    values: (B * K, d, R, C) maps of K zero-shot images per RGB image
     Returns rays (B * K, C, P, d).
     """
     cross = cross.unflatten(0, (-1, values.shape[-1]))  # B C heads P R

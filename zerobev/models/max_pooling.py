@@ -1,12 +1,12 @@
-"""Zero-BEV with an attention that max-pools: variant (f), which is not in the paper.
+"""Zero-BEV with an attention that max-pools: variant (f), not in the paper.
 
-photograph -> backbone -> pyramid -> gates: does this pixel show at that position of its ray?
-                            :          :
-                            :          :-- noisy OR with the zero-shot image, as it is -> embedding --.
-                            '----------'-- mean, weighted with the gates -> map features ------------ + -> U-Net
+RGB image -> backbone -> pyramid -> gates, one per pixel and position of its ray
+                           :          :
+                           :          :-- noisy OR with the unprocessed zero-shot image -> embedding --.
+                           '----------'-- mean, weighted with the gates -> map features -------------- + -> U-Net
 
 The paper's supplement calls max-pooling along the vertical the open point of its Theorem 3.1: attention averages, and
-an average of binary values is no maximum. Gates that each say yes or no, and an OR over them, are one.
+an average of binary values is not a maximum. An OR over binary gates is.
 """
 
 import torch
@@ -21,24 +21,24 @@ from zerobev.models.decoder import BevDecoder
 from zerobev.models.polar import PolarToCartesian, floor_row
 from zerobev.models.pyramid import FeaturePyramid
 
-#: Before training a gate falls by 1 (as a logit) over this share of the image's height, away from the row of the floor.
+#: Initial logits of gates fall by 1 over this fraction of the image's height, away from the row of the floor.
 _FLOOR_WIDTH = 1 / 32
-#: No gate starts lower than this (as a logit): it could not open any more.
-_LOWEST = -4.0
+#: Minimum of these initial logits: gates with lower ones would stay closed.
+_MIN_LOGIT = -4.0
 
 
 def noisy_or(logits: Tensor, values: Tensor) -> Tensor:
-    """1 - prod_y (1 - g h_y) for gates g = sigmoid(logits) and values h in [0, 1].
+    """1 - prod_y (1 - g_y h_y) for gates g = sigmoid(logits) and values h in [0, 1], per modality.
 
-    The maximum over the pixels whose gate is open where gates are 0 or 1 and values binary; in between, at least every
-    single g h_y and at most their sum; monotone in every value, and modality by modality.
+    For binary gates and values this is the maximum over the pixels with an open gate. In general it lies between the
+    maximum of g_y h_y and their sum, and is monotone in every value.
 
     logits: (..., P, R) of P positions over R pixels
     values: (..., R, K) of K modalities
     Returns (..., P, K) in [0, 1].
     """
     if bool(((values == 0) | (values == 1)).all()):
-        # log (1 - g h) = h log (1 - g): one matrix product serves all modalities
+        # log (1 - g h) = h log (1 - g): one matrix product for all modalities
         closed = -F.softplus(logits) @ values.to(logits.dtype)
     else:
         gates = logits.sigmoid().float().clamp(max=1 - 1e-6)
@@ -47,20 +47,20 @@ def noisy_or(logits: Tensor, values: Tensor) -> Tensor:
 
 
 class Gates(nn.Module):
-    """For each pixel of the photograph and each position of its column's ray, whether the one shows on the other.
+    """Logits per pixel of the RGB image and position of its column's ray: is the pixel projected to the position?
 
-    A logit is the sum of what the pixel's features tell and of what its row does. The latter starts at the projection
-    of a flat floor.
+    A logit is the sum of a value from the pixel's features and a trained prior of its row. The prior starts at the
+    projection of a flat floor.
     """
 
     def __init__(self, camera: CameraConfig, width: int, stride: int):
         super().__init__()
         self.side, self.stride = camera.fpv_px, stride
-        self.head = nn.Conv2d(width, camera.bev_px * stride**2, 1)  # for each pixel under a feature
+        self.head = nn.Conv2d(width, camera.bev_px * stride**2, 1)  # per pixel under a feature
         nn.init.normal_(self.head.weight, std=0.3 * width**-0.5)
         nn.init.zeros_(self.head.get_parameter("bias"))
         away = torch.arange(camera.fpv_px) - floor_row(camera, range(camera.bev_px), 1)[:, None]
-        self.prior = nn.Parameter((-away.abs() / (_FLOOR_WIDTH * camera.fpv_px)).clamp(min=_LOWEST).float())  # P H
+        self.prior = nn.Parameter((-away.abs() / (_FLOOR_WIDTH * camera.fpv_px)).clamp(min=_MIN_LOGIT).float())  # P H
 
     def forward(self, features: Tensor) -> Tensor:
         """Finest features (B, width, R, C) -> logits (B, W, P, H); position p is map row p, top row first."""
@@ -69,11 +69,11 @@ class Gates(nn.Module):
 
 
 class MaxPoolZeroBEV(BevModel):
-    """Geometry from the photograph alone, values that no network touches before they are on the map.
+    """Geometry from the RGB image alone; zero-shot values are pooled to the map before any network processes them.
 
-    Each pixel of the zero-shot image keeps its own gates, so that the pooled map is as fine as the image allows; the
-    U-Net, which sees the photograph's features on the map too, then completes what is hidden. Gates do not depend on
-    the zero-shot images and are computed once for all of them.
+    Every pixel of the zero-shot image has its own gates, so the pooled map has the resolution of the image. The U-Net
+    then completes hidden parts; its input also contains the RGB features on the map. Gates do not depend on the
+    zero-shot images and are computed once for all of them.
     """
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
@@ -91,28 +91,27 @@ class MaxPoolZeroBEV(BevModel):
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
     def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
-        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
+        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
-        depth: (B, 1, H, W) metres, true or estimated; the residual variant alone reads it
+        depth: (B, 1, H, W) metres, true or estimated; used only in the residual variant
         """
         self.check_inputs(rgb, zero, depth)
         (features,) = self.pyramid(self.backbone(rgb))
         gates = self.gates(features)
         pooled = noisy_or(gates, zero.permute(0, 3, 2, 1))  # B W P K
         pooled = self.resample_pixels(pooled)[0].permute(0, 3, 1, 2)  # B K M M
-        seen = [pooled]
+        maps = [pooled]
         if self.config.residual:
             assert depth is not None  # as checked
-            seen.append(inverse_project(zero, depth, self.camera))
-        known = self.map_features(features, gates)[:, None] + self.embedding(
-            torch.stack(seen, dim=2).flatten(0, 1)
-        ).unflatten(0, zero.shape[:2])
-        logits = torch.cat([self.decoder(part) for part in known.flatten(0, 1).split(max(len(zero), IMAGES_PER_PASS))])
+            maps.append(inverse_project(zero, depth, self.camera))
+        embedded = self.embedding(torch.stack(maps, dim=2).flatten(0, 1)).unflatten(0, zero.shape[:2])
+        inputs = (self.map_features(features, gates)[:, None] + embedded).flatten(0, 1)
+        logits = torch.cat([self.decoder(part) for part in inputs.split(max(len(zero), IMAGES_PER_PASS))])
         logits = logits.unflatten(0, zero.shape[:2])
         return MapLogits(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None, pooled)
 
     def map_features(self, features: Tensor, gates: Tensor) -> Tensor:
-        """The photograph's features (B, d, R, C) on the map, (B, d, M, M): their mean, weighted with the gates."""
+        """RGB features (B, d, R, C) on the map, (B, d, M, M): their mean, weighted with the gates."""
         stride, rows = self.config.stem_stride, features.shape[-2]
         open_ = gates[:, ::stride].sigmoid()  # B C P H
         open_ = F.pad(open_, (0, rows * stride - open_.shape[-1])).unflatten(-1, (rows, stride)).mean(-1)

@@ -1,13 +1,11 @@
-"""From polar rays to the Cartesian map: the part of the geometry that is known and not learnt.
+"""From polar rays to the Cartesian map: the known part of the geometry, without parameters.
 
-An image column u, in pixels from the left edge of the image, sees the points x = z (u - W / 2) / focal at every planar
-depth z. A cell of the map in column c and row r has its centre at
+Image column u, in pixels from the left edge of the image, contains the points x = z (u - W / 2) / focal at planar depth
+z. A map cell with its centre at x to the right and z forward is therefore in column u = W / 2 + focal x / z.
 
-    x = (c + 1/2) cell - extent / 2,    z = (M - r - 1/2) cell,    so it lies in u = W / 2 + focal x / z.
-
-The positions on a ray are the map's own rows of planar depth z, as in Saha et al. (2022), so resampling a band is an
-interpolation along the image columns, another one for each row. It is linear, hence a fixed matrix a row: one batched
-matrix product, whose gradient is another one, without scattered additions, and the same on every run.
+Positions on a ray are map rows of planar depth z, as in Saha et al. (2022). Resampling a band is thus a linear
+interpolation along the image columns per row, a fixed matrix per row: one batched matrix product. Its gradient is
+another matrix product, without scattered additions, and deterministic.
 """
 
 from itertools import pairwise
@@ -17,13 +15,14 @@ from torch import Tensor, nn
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
+from zerobev.geometry.cameras import bev_cell_centres
 
 
 def band_rows(camera: CameraConfig, edges_m: tuple[float, ...]) -> list[range]:
-    """The map rows of each depth band, near band first; band b covers depths `edges_m[b]` to `edges_m[b + 1]`.
+    """Map rows of each depth band, near band first; band b covers depths `edges_m[b]` to `edges_m[b + 1]`.
 
-    Edges are rounded to whole cells. Raises `InputError` unless they rise from 0 to the map's extent and leave every
-    band a row.
+    Edges are rounded to whole cells. Raises `InputError` unless they rise from 0 to the map's extent, by at least a row
+    per band.
     """
     cells = [round(edge / camera.cell_m) for edge in edges_m]
     if cells[0] != 0 or cells[-1] != camera.bev_px or any(a >= b for a, b in pairwise(cells)):
@@ -35,20 +34,18 @@ def band_rows(camera: CameraConfig, edges_m: tuple[float, ...]) -> list[range]:
 
 
 def image_column(camera: CameraConfig, rows: range) -> Tensor:
-    """The image column u that sees each cell centre of map rows `rows`: (P, M) float64, pixels from the left edge."""
-    cell = camera.cell_m
-    x = (torch.arange(camera.bev_px, dtype=torch.float64) + 0.5) * cell - camera.bev_extent_m / 2  # M
-    z = (camera.bev_px - torch.tensor(rows, dtype=torch.float64) - 0.5) * cell  # P
-    return camera.fpv_px / 2 + camera.focal_px * x / z[:, None]
+    """Image column u of each cell centre of map rows `rows`: (P, M) float64, pixels from the left edge."""
+    x, z = (torch.as_tensor(axis[rows]) for axis in bev_cell_centres(camera))
+    return camera.fpv_px / 2 + camera.focal_px * x / z
 
 
 def floor_row(camera: CameraConfig, rows: range, stride: int) -> Tensor:
-    """The row of a feature map, as a real number, that sees the floor at the depth of each map row: (P,) float64.
+    """Row of a feature map, as a real number, with the floor at the depth of each map row: (P,) float64.
 
-    The camera does not pitch, so that floor at depth z is seen at image row H / 2 + focal height / z in every column.
-    Floor below the image is taken for its last row.
+    The camera is level, so the floor at depth z is at image row H / 2 + focal height / z in every column. Floor below
+    the image counts as its last row.
     """
-    z = (camera.bev_px - torch.tensor(rows, dtype=torch.float64) - 0.5) * camera.cell_m
+    z = torch.as_tensor(bev_cell_centres(camera)[1][rows, 0])
     v = camera.fpv_px / 2 + camera.focal_px * camera.height_m / z
     return (v / stride - 0.5).clamp(max=-(-camera.fpv_px // stride) - 1)
 
@@ -57,8 +54,7 @@ class PolarToCartesian(nn.Module):
     """Resample one band of polar rays to the cells of map rows `rows`, linearly between the centres of feature columns.
 
     Feature column i of a map with stride s has its centre at image column u = s (i + 1/2), as with
-    `align_corners=False`; beyond the outermost centres their values go on to the image's edge. Cells that no image
-    column sees are zero.
+    `align_corners=False`; the outermost values extend to the image's edge. Cells outside the image are zero.
     """
 
     weights: Tensor  #: (P, M, C)
@@ -70,7 +66,7 @@ class PolarToCartesian(nn.Module):
         columns = -(-camera.fpv_px // stride)
         position = (u / stride - 0.5).clamp(0, columns - 1)  # in feature columns
         valid = (u >= 0) & (u <= camera.fpv_px)
-        # A linear interpolation gives column i the weight of a hat of half-width 1 around it.
+        # linear interpolation: the weight of column i is a hat function of half-width 1 around it
         weights = (1 - (position[..., None] - torch.arange(columns)).abs()).clamp(min=0) * valid[..., None]
         self.register_buffer("weights", weights.float(), persistent=False)
         self.register_buffer("valid", valid, persistent=False)

@@ -1,13 +1,13 @@
-"""The feature pyramid (Lin et al. 2017) that gives every stride the same width and the context of the coarser ones."""
+"""The feature pyramid (Lin et al. 2017): the same width at every stride, with the context of coarser maps."""
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 
 class FeaturePyramid(nn.Module):
-    """1x1 laterals, top-down nearest upsampling, 3x3 outputs; all maps get `width` channels, sizes stay.
+    """1x1 laterals, top-down nearest upsampling, 3x3 outputs; all maps get `width` channels, sizes are kept.
 
-    outputs: how many maps come out, the finest ones; None: all
+    outputs: number of output maps, the finest ones; None: all
     """
 
     def __init__(self, channels: tuple[int, ...], width: int, outputs: int | None = None):
@@ -19,11 +19,11 @@ class FeaturePyramid(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, maps: list[Tensor]) -> list[Tensor]:
-        """Maps (N, channels[b], R_b, C_b), finest first -> (N, width, R_b, C_b); each size half the last."""
+        """Maps (N, channels[b], R_b, C_b), finest first, each half the size of the last -> (N, width, R_b, C_b)."""
         merged = [lateral(features) for lateral, features in zip(self.laterals, maps)]
         for fine in range(len(merged) - 2, -1, -1):
             rows, columns = merged[fine].shape[-2:]
-            # Doubled and cropped, not stretched: at odd sizes too, coarse pixel i stays over fine pixels 2i and 2i + 1.
+            # doubled and cropped, not stretched: coarse pixel i matches fine pixels 2i and 2i + 1 at odd sizes, too
             doubled = F.interpolate(merged[fine + 1], scale_factor=2, mode="nearest")
             merged[fine] = merged[fine] + doubled[..., :rows, :columns]
-        return [output(features) for output, features in zip(self.outputs, merged)]  # of the finest ones
+        return [output(features) for output, features in zip(self.outputs, merged)]  # the finest ones

@@ -1,6 +1,6 @@
 """TIM, *Translating Images into Maps* (Saha et al. 2022): Zero-BEV's parts trained on the target classes (row (b.2)).
 
-With the segmentation as a further input (row (b.3)) it has the same information as the zero-shot methods.
+With the segmentation as an additional input (row (b.3)) it has the same information as the zero-shot methods.
 """
 
 import torch
@@ -16,10 +16,9 @@ from zerobev.models.pyramid import FeaturePyramid
 
 
 class TIM(BevModel):
-    """From a photograph, and with `segmentation` the masks of the eight classes, to maps of these classes.
+    """From an RGB image, and with `segmentation` the masks of the eight classes, to maps of these classes.
 
-    The masks go together through one CNN, as wide as Zero-BEV's, and join the photograph's maps where its zero-shot
-    image does.
+    One CNN, as wide as Zero-BEV's zero CNN and at its place in the network, has all masks as input.
     """
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
@@ -34,15 +33,15 @@ class TIM(BevModel):
         self.decoder = BevDecoder(model.width, model.decoder_channels, len(LABELS))
 
     def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> MapLogits:
-        """Photograph (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`.
+        """RGB (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`.
 
-        zero: (B, 8, H, W) masks of the classes in the order of `LABELS`; read with `segmentation` alone
+        zero: (B, 8, H, W) masks of the classes in the order of `LABELS`; used only with `segmentation`
         """
         features, _ = self.bands(self.fpv_maps(rgb, zero))
         return MapLogits(self.decoder(features), None)
 
     def attention(self, rgb: Tensor, zero: Tensor | None = None) -> list[BandAttention]:
-        """Attention of B photographs, near band first, laid out as `ZeroBEV.attention`."""
+        """Attention for B RGB images, near band first, laid out as `ZeroBEV.attention`."""
         return self.bands(self.fpv_maps(rgb, zero))[1]
 
     def fpv_maps(self, rgb: Tensor, zero: Tensor | None) -> list[Tensor]:

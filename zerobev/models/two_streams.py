@@ -1,8 +1,8 @@
 """Zero-BEV with the inductive bias (paper, Section 3.4, Eqs. 7 and 8; supplement, "Zero-BEV with inductive bias").
 
-photograph -> backbone -> pyramid -> transformers ---> map features -> U-Net -> auxiliary logits
-                                          : attention                    = (shared weights)
-zero-shot  -> zero CNN ------------> weighted sums --> map features -> U-Net -> zero-shot logits
+RGB image -> backbone -> pyramid -> transformers ---> map features -> U-Net -> auxiliary logits
+                                         : attention                    = (shared weights)
+zero-shot -> zero CNN ------------> weighted sums --> map features -> U-Net -> zero-shot logits
 """
 
 import torch
@@ -19,15 +19,14 @@ from zerobev.models.pyramid import FeaturePyramid
 
 
 class TwoStreamZeroBEV(BevModel):
-    """Two streams with one attention (paper, Fig. 2e): where things are is read from the photograph alone.
+    """Two streams with one attention (paper, Fig. 2e): geometry comes from the RGB image alone.
 
-    The RGB stream is a transformer with queries, keys and values of its own. In the zero-shot stream queries and keys
-    are the RGB stream's, of the last cross-attention, and the values are the zero CNN's columns as they are; the
-    attention's output projection brings the heads together and to the width of the map. The two U-Nets share all
-    weights: each stream reads its own channels of the output. Attention does not depend on the zero-shot images, and is
-    computed once for all of them.
+    The RGB stream is a transformer. The zero-shot stream uses the attention weights of the RGB stream's last
+    cross-attention, with the zero CNN's columns as values; an output projection merges the heads and gives the width of
+    the map. The two U-Nets share all weights and have separate output channels. Attention does not depend on the
+    zero-shot images and is computed once for all of them.
 
-    Raises `InputError` for a configuration without auxiliary maps, which alone train the RGB stream's values.
+    Raises `InputError` for a configuration without auxiliary maps: only these train the RGB stream's values.
     """
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
@@ -42,18 +41,18 @@ class TwoStreamZeroBEV(BevModel):
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
     def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
-        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `MapLogits`."""
+        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `MapLogits`."""
         batch = self.check(rgb=(rgb, 3), zero=(zero, None))
         rgb_features, attention = self.bands(self.pyramid(self.backbone(rgb)))
         zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])[::-1]  # near band first
         zero_rays = [out(reweigh(band.cross[-1], m)) for out, band, m in zip(self.outs, attention, zero_maps)]
         zero_features = self.bands.to_map(zero_rays)
-        # In training both streams pass together: one set of batch statistics, as in evaluation.
+        # in training both streams are one batch: one set of batch statistics, as in evaluation
         features = torch.cat([rgb_features, zero_features]).split(max(2 * batch, IMAGES_PER_PASS))
         logits = torch.cat([self.decoder(part) for part in features])
         return MapLogits(logits[batch:, 0].unflatten(0, zero.shape[:2]), logits[:batch, 1:])
 
     def attention(self, rgb: Tensor, zero: Tensor | None = None) -> list[BandAttention]:
-        """Attention of B photographs, near band first, laid out as `ZeroBEV.attention`; no zero-shot image counts."""
+        """Attention for B RGB images, near band first, laid out as `ZeroBEV.attention`; `zero` is not used."""
         self.check(rgb=(rgb, 3))
         return self.bands(self.pyramid(self.backbone(rgb)))[1]

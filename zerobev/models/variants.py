@@ -1,4 +1,4 @@
-"""Every network by the letter of its row in the paper's Tables 1 and 2, or (f), and by its checkpoint."""
+"""All networks, by row of the paper's Tables 1 and 2 (or "f"), and by checkpoint."""
 
 import math
 from dataclasses import replace
@@ -17,7 +17,7 @@ from zerobev.models.two_streams import TwoStreamZeroBEV
 from zerobev.models.vpn import VPN
 from zerobev.models.zero_bev import ZeroBEV
 
-#: row -> class, and what the row changes in the configuration of a scale
+#: Row -> class, and changes of the row to the configuration of a scale.
 VARIANTS: dict[str, tuple[type[BevModel], dict[str, Any]]] = {
     "b.1": (VPN, {"aux": ()}),
     "b.2": (TIM, {"aux": ()}),
@@ -35,10 +35,10 @@ VARIANTS: dict[str, tuple[type[BevModel], dict[str, Any]]] = {
 
 
 def build(row: str, camera: CameraConfig, model: ModelConfig) -> BevModel:
-    """The network of a row, with random weights from torch's generator; an unknown row is an `InputError`.
+    """The network of a row, with random weights from torch's generator. Raises `InputError` for an unknown row.
 
-    Maps of a modality or a class start from `model.foreground_prior`, auxiliary maps from one half. White is rare: if a
-    map starts half white, the Dice loss of a rare class has its minimum at all white for hundreds of steps.
+    The initial probability is `model.foreground_prior` in maps of a modality or class, and 1/2 in auxiliary maps. White
+    is rare: from 1/2, the Dice loss of a rare class would have its minimum at all white for hundreds of steps.
     """
     if row not in VARIANTS:
         raise InputError(f"row: expected one of {', '.join(VARIANTS)}, found {row!r}")
@@ -51,7 +51,7 @@ def build(row: str, camera: CameraConfig, model: ModelConfig) -> BevModel:
 
 
 def load_model(path: Path) -> BevModel:
-    """The network saved in `path`, whatever its class; as `BevModel.load`, which names what is wrong with a file."""
+    """The network saved in `path`, of any class. Raises `InputError` as `BevModel.load`."""
     networks: list[type[BevModel]] = [*(network for network, _ in VARIANTS.values()), DepthNet]
     classes = {network.__name__: network for network in networks}
     name = description(path)["class"]

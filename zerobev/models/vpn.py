@@ -9,13 +9,13 @@ from torch import Tensor, nn
 from zerobev.config import LABELS, CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder
 from zerobev.models.base import BevModel, MapLogits
-from zerobev.models.decoder import convolution, upsample
+from zerobev.models.decoder import convolution, resize
 
 POOLED_SIDES = (1, 2, 3, 6)  #: of the pyramid pooling
 
 
 class PyramidPooling(nn.Module):
-    """Averages over a map's parts at several sizes, beside the map itself (Zhao et al. 2017), to logits."""
+    """Logits from a map and its averages over regions of several sizes (Zhao et al. 2017)."""
 
     def __init__(self, in_channels: int, width: int, out_channels: int, dropout: float):
         super().__init__()
@@ -30,16 +30,16 @@ class PyramidPooling(nn.Module):
         parts = [features]
         for side, branch, norm in zip(POOLED_SIDES, self.branches, self.norms):
             pooled = branch(F.adaptive_avg_pool2d(features, side))
-            # Normalised at full size: a batch of one has a single value a channel where all is pooled into one.
-            parts.append(norm(upsample(pooled, features)).relu())
+            # normalised at full size: pooled to one region, a batch of one has a single value per channel
+            parts.append(norm(resize(pooled, features.shape[-2:])).relu())
         return self.head(self.dropout(self.merge(torch.cat(parts, dim=1))))
 
 
 class VPN(BevModel):
-    """From a photograph to maps of the eight classes, through fully connected layers from image to map positions.
+    """From an RGB image to maps of the eight classes, through fully connected layers from image to map positions.
 
-    Every channel of the backbone's third map, flattened, passes the same two layers; their output is taken for a coarse
-    map seen from above, which pyramid pooling turns into logits. The pooling is twice as wide as the other networks.
+    The same two layers transform every flattened channel of the backbone's third map to a coarse map from above.
+    Pyramid pooling, twice as wide as the other networks, turns it into logits.
     """
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
@@ -52,9 +52,8 @@ class VPN(BevModel):
         self.decoder = PyramidPooling(model.vpn_channels[-1], 2 * model.width, len(LABELS), model.dropout)
 
     def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> MapLogits:
-        """Photograph (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`."""
+        """RGB (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`."""
         self.check(rgb=(rgb, 3))
         features = self.backbone(rgb)[-1]
         from_above = self.view(features.flatten(2)).unflatten(2, features.shape[2:])
-        size = (self.camera.bev_px, self.camera.bev_px)
-        return MapLogits(F.interpolate(self.decoder(from_above), size, mode="bilinear", align_corners=False), None)
+        return MapLogits(resize(self.decoder(from_above), (self.camera.bev_px, self.camera.bev_px)), None)

@@ -1,9 +1,9 @@
 """The Zero-BEV network (paper, Section 3.3 and supplement, "Zero-BEV base model" and "Zero-BEV, residual variant").
 
-photograph -> backbone --.
-                          concatenate -> pyramid -> one transformer a depth band -> map features -> U-Net -> logits
-zero-shot  -> zero CNN --'                                                               :
-     '------- P^-1 with depth, max-pooling to the ground -> embedding  (residual) .......'
+RGB image -> backbone --.
+                         concatenate -> pyramid -> one transformer per depth band -> map features -> U-Net -> logits
+zero-shot -> zero CNN --'                                                                 :
+    '------- P^-1 with depth, max-pooling to the ground -> embedding  (residual) .........'
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ from zerobev.models.pyramid import FeaturePyramid
 
 
 class ZeroBEV(BevModel):
-    """Zero-BEV (paper, Fig. 2c; with `residual` 2d): project any zero-shot image to the map, given the photograph.
+    """Zero-BEV (paper, Fig. 2c; with `residual` 2d): project any zero-shot image to the map, given the RGB image.
 
-    The photograph's features are computed once; each zero-shot image then goes its own way through the zero CNN and
-    everything behind it, so the maps of several images do not depend on each other. The auxiliary logits are the mean
-    over these passes: with one image, as in training, they are the pass's own, and the order of images is of no effect.
+    RGB features are computed once. Each zero-shot image then has a separate pass through the zero CNN and all later
+    parts, so its map does not depend on other images. The auxiliary logits are the mean over these passes (one pass in
+    training), and do not depend on the order of images.
     """
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
@@ -42,12 +42,12 @@ class ZeroBEV(BevModel):
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
     def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
-        """Photograph (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
+        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
-        depth: (B, 1, H, W) metres, true or estimated; the residual variant alone reads it
+        depth: (B, 1, H, W) metres, true or estimated; used only in the residual variant
         """
         self.check_inputs(rgb, zero, depth)
-        images = [zero]  # and what else belongs to each of them
+        images = [zero]
         if self.config.residual:
             assert depth is not None  # as checked
             images.append(inverse_project(zero, depth, self.camera))
@@ -57,9 +57,9 @@ class ZeroBEV(BevModel):
         return MapLogits(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None)
 
     def pass_images(self, rgb_maps: Sequence[Tensor], zero: Tensor, projected: Tensor | None = None) -> Tensor:
-        """Maps of B photographs, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).
+        """RGB features of B images, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).
 
-        projected: (B, K, M, M), P^-1 of these images, in the residual variant
+        projected: (B, K, M, M), P^-1 of the zero-shot images, in the residual variant
         """
         features, _ = self.bands(self.pyramid(self.fpv_maps(rgb_maps, zero)))
         if projected is not None:
@@ -67,17 +67,17 @@ class ZeroBEV(BevModel):
         return self.decoder(features).unflatten(0, zero.shape[:2])
 
     def fpv_maps(self, rgb_maps: Sequence[Tensor], zero: Tensor) -> list[Tensor]:
-        """Concatenate the photograph's maps with those of each zero-shot image, (B * K, channels, R_b, C_b)."""
+        """RGB features concatenated with those of each zero-shot image, (B * K, channels, R_b, C_b)."""
         zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])
-        # repeated once, maps would be copied all the same, and lose their layout, channels last
+        # repeating maps, even once, copies them and loses their layout, channels last
         shared = rgb_maps if zero.shape[1] == 1 else [maps.repeat_interleave(zero.shape[1], 0) for maps in rgb_maps]
         return [torch.cat(pair, dim=1) for pair in zip(shared, zero_maps)]
 
     def attention(self, rgb: Tensor, zero: Tensor) -> list[BandAttention]:
-        """Attention of the pass of B photographs and zero-shot images (B, 1, H, W), near band first.
+        """Attention for B RGB images and zero-shot images (B, 1, H, W), near band first.
 
-        The first axis of each tensor is B * C, image column fastest; `cross[-1].unflatten(0, (B, -1))[b, c, :, p]` is
-        what position p (map row `band_rows(...)[band][p]`) of the ray of column c attends to, top row first.
+        The first axis of each tensor is B * C, image column fastest. `cross[-1].unflatten(0, (B, -1))[b, c, :, p]` are
+        the weights, per head and image row (top first), of position p (map row `band_rows(...)[band][p]`) of column c.
         """
         self.check(rgb=(rgb, 3), zero=(zero, 1))
         return self.bands(self.pyramid(self.fpv_maps(self.backbone(rgb), zero)))[1]

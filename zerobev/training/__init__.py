@@ -1,1 +1,1 @@
-"""Losses, training, evaluation and metrics."""
+"""Training: losses, batches, learning rate, history."""

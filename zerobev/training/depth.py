@@ -1,9 +1,8 @@
 """Training, evaluation and use of depth estimators (paper, supplement, "Finetuning monocular depth estimation").
 
-The objective is the mean absolute difference in metres, for our own network from its first step as for fine-tuning.
+The objective is the mean absolute difference in metres, for our own network and for fine-tuning.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,37 +14,37 @@ from zerobev.config import TrainConfig
 from zerobev.data.samples import ViewSampler, ViewSet, as_float
 from zerobev.models.depth import DepthEstimator
 from zerobev.training.history import History
+from zerobev.training.loader import Batch
 from zerobev.training.losses import Losses
 from zerobev.training.train import train
 
-Batch = Mapping[str, Tensor]
-_BATCH = 32  # photographs that are estimated together
+_BATCH = 32  # images per forward pass
 
 
 class DepthSamples:
-    """Endless pairs of photograph and depth; half of them mirrored, since a mirrored home is a home.
+    """Endless pairs of image and depth, half of them mirrored; each pass over the views has a new random order.
 
-    Sample i is a function of (seed, i) alone. Each pass over the views is in a new random order.
+    Sample i is a function of (seed, i) alone.
     """
 
     def __init__(self, views: ViewSet, seed: int, batch: int) -> None:
         self._views, self._seed, self._batch = views, seed, batch
         self._order = ViewSampler(len(views), seed)
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
-        """`rgb` (B, 3, H, W) uint8 and `depth` (B, 1, H, W) float32, metres, of a training step."""
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
+        """`rgb` (B, 3, H, W) uint8 and `depth` (B, 1, H, W) float32, metres; see `training.loader.Source`."""
         first = step * self._batch
-        return _collated([self.sample(i) for i in range(first + rank, first + self._batch, ranks)])
+        return _collated([self.sample(i) for i in range(first + rank, first + self._batch, world_size)])
 
     def sample(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pair number `index`: photograph (H, W, 3) uint8 and depth (H, W) float32, metres."""
+        """Image (H, W, 3) uint8 and depth (H, W) float32, metres."""
         rgb, depth = _pair(self._views, self._order[index])
         mirrored = np.random.default_rng([self._seed, 1, index]).random() < 0.5
         return (rgb[:, ::-1], depth[:, ::-1]) if mirrored else (rgb, depth)
 
 
 def depth_objective(model: nn.Module, batch: Batch) -> Losses:
-    """Mean absolute difference over the pixels whose depth is known (above 0), metres."""
+    """Mean absolute difference over the pixels with known depth (above 0), metres."""
     valid = batch["depth"] > 0
     error = (model(batch["rgb"]).float() - batch["depth"]).abs()
     loss = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
@@ -63,9 +62,9 @@ def train_depth(
     key: str,
     device: torch.device | str | None = None,
 ) -> History:
-    """Train a `DepthEstimator` in place; it is left with the weights that validated best (see `training.train`).
+    """Train a `DepthEstimator` in place, to the weights with the best validation score (see `training.train`).
 
-    validation: all its views, unmirrored, are the validation set; the score is their mean absolute error, metres
+    validation: all its views, unmirrored; the score is the mean absolute difference over them, metres
     """
     held_out = [_views_batch(validation, first) for first in range(0, len(validation), _BATCH)]
     data = DepthSamples(views, seed, config.batch)
@@ -74,14 +73,14 @@ def train_depth(
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Means over all pixels whose depth is known."""
+    """Means over all pixels with known depth."""
 
     mad_m: float  #: mean absolute difference, metres
     relative: float  #: mean of absolute difference over true depth
 
 
 def depth_errors(estimator: DepthEstimator, views: ViewSet, device: torch.device | str = "cpu") -> DepthErrors:
-    """The two errors that the paper states of its estimator, on `views`."""
+    """Depth errors on `views`, the two that the paper states for its estimator."""
     absolute = relative = pixels = 0.0
     for shard in views.shards:
         (predicted,) = predict_depth(estimator, ViewSet([shard]), device)
@@ -95,9 +94,9 @@ def depth_errors(estimator: DepthEstimator, views: ViewSet, device: torch.device
 
 @torch.inference_mode()
 def predict_depth(estimator: DepthEstimator, views: ViewSet, device: torch.device | str = "cpu") -> list[np.ndarray]:
-    """Estimated depth of all views: one (V, H, W) float16 array a shard, metres, as `ViewSet.with_depth` takes them.
+    """Estimated depth of all views: one (V, H, W) float16 array per shard, metres, for `ViewSet.with_depth`.
 
-    The estimator is moved to `device` and put into evaluation mode, in float32.
+    The estimator is moved to `device` and put into evaluation mode; it computes in float32.
     """
     estimator = estimator.to(device).eval()
     maps = [

@@ -1,4 +1,4 @@
-"""Processes that train and evaluate together (`accelerate launch`)."""
+"""Training and evaluation in several processes (`accelerate launch`)."""
 
 from torch import distributed
 

@@ -1,4 +1,4 @@
-"""What a training tells of itself: losses and scores, step by step."""
+"""Training history: losses and validation scores."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,28 +6,28 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Entry:
-    """A line of the history; losses are means since the entry before."""
+    """One entry of the history; losses are means since the previous entry."""
 
     step: int  #: steps done
     loss: float
     main: float  #: loss of the evaluated output (the zero-shot stream)
     aux: float | None
     learning_rate: float  #: of the last step
-    seconds: float  #: of training so far, without those lost to an interruption
-    validation: float | None  #: score of the model after this step, where it was validated
+    seconds: float  #: of training so far, without time lost to interruptions
+    validation: float | None  #: score after this step; None: not validated
 
 
 @dataclass(frozen=True)
 class History:
-    """What a finished run tells of itself."""
+    """History of a finished training."""
 
     entries: tuple[Entry, ...]
-    best_step: int  #: whose weights were kept
+    best_step: int  #: step of the best validation score, and of the final weights
     best_score: float
     seconds: float
 
     def curves(self) -> dict[str, list[float | None]]:
-        """`columns`, thinned to about a hundred entries beside those at validations: for a record."""
+        """`columns` of the validations and about a hundred other entries, for a record."""
         stride = max(len(self.entries) // 100, 1)
         return columns([e for i, e in enumerate(self.entries) if i % stride == 0 or e.validation is not None])
 

@@ -1,4 +1,4 @@
-"""Batches, drawn by worker processes where that pays."""
+"""Batches on the device, optionally drawn by worker processes."""
 
 import os
 from collections.abc import Generator, Mapping
@@ -12,34 +12,34 @@ from torch.utils.data import DataLoader, Dataset
 from zerobev.common.errors import InputError
 from zerobev.data.samples import as_float
 
-#: More read no faster from one disk.
+#: More workers read no faster from one disk.
 _MAX_WORKERS = 16
 
 Batch = Mapping[str, Tensor]
 
 
 class Source(Protocol):
-    """Training data without an end, addressed by step."""
+    """Endless training data, addressed by step."""
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> Batch:
-        """The share of process `rank` of `ranks` in the batch of `step`.
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> Batch:
+        """Part of process `rank` in the batch of `step`.
 
-        The batch holds the samples `step * n ... (step + 1) * n - 1`, n = `TrainConfig.batch`; a process gets every
-        `ranks`-th of them, from `rank` on. Depends on nothing else, may be called in another process, and does not
-        touch torch's global generator.
+        The batch holds the samples `step * n ... (step + 1) * n - 1`, n = `TrainConfig.batch`; its part is every
+        `world_size`-th of them, from `rank` on. The result depends only on the arguments. Calls may come from another
+        process and leave torch's global generator unchanged.
         """
 
 
 class _Steps(Dataset):
-    """A process's share of a source, as torch's loader reads it: item number i is the batch of step i."""
+    """A source as a torch dataset: item i is this process's part of the batch of step i."""
 
-    def __init__(self, source: Source, place: tuple[int, int]) -> None:
-        self._source, self._place = source, place
+    def __init__(self, source: Source, rank: int, world_size: int) -> None:
+        self._source, self._rank, self._world_size = source, rank, world_size
 
     def __getitem__(self, step: int) -> Batch | InputError:
         try:
-            return self._source.batch(step, *self._place)
-        except InputError as error:  # raised where it is received: the loader would wrap it into a worker's traceback
+            return self._source.batch(step, self._rank, self._world_size)
+        except InputError as error:  # raised by `batches`: torch's loader would add the worker's traceback
             return error
 
 
@@ -47,27 +47,28 @@ def batches(
     source: Source,
     steps: range,
     device: torch.device,
-    place: tuple[int, int] = (0, 1),
+    rank: int = 0,
+    world_size: int = 1,
     workers: int | None = None,
 ) -> Generator[Batch, None, None]:
     """The batches of `steps`, in order, on the device: of a training, or of a pass over test views.
 
-    place: rank of this process, and the number of those that share each batch
-    workers: processes that draw batches ahead of their use; they change nothing but the time. Default: `gpu_workers`
-        on a GPU, none on a CPU, where they would take from a step what they save.
+    rank, world_size: of the processes among which each batch is divided
+    workers: processes that draw batches ahead of their use, with the same result. Default: `gpu_workers` on a GPU; none
+        on a CPU, where they would slow down the steps
 
-    Raises `InputError` as the source does, and `RuntimeError` where a worker dies.
+    Raises `InputError` as the source does, and `RuntimeError` if a worker dies.
     """
     on_gpu = device.type == "cuda"
     if workers is None:
         workers = gpu_workers() if on_gpu else 0
     loader = DataLoader(
-        _Steps(source, place),
-        batch_size=None,  # a source's batches are whole
+        _Steps(source, rank, world_size),
+        batch_size=None,  # items are whole batches
         sampler=steps,
         num_workers=workers,
         pin_memory=on_gpu,
-        generator=torch.Generator(),  # of seeds that no source takes; the global one is that of dropout
+        generator=torch.Generator(),  # unused by sources; the default would advance the global one, of dropout
     )
     for batch in loader:
         if isinstance(batch, InputError):
@@ -81,11 +82,11 @@ def model_inputs(batch: Batch) -> list[Tensor]:
 
 
 def moved(batch: Batch, device: torch.device) -> Batch:
-    """The batch on the device, and only there as floats."""
+    """The batch on the device, converted to floats there."""
     return as_float({name: value.to(device, non_blocking=True) for name, value in batch.items()})
 
 
 def gpu_workers() -> int:
-    """Workers beside a training on a GPU: the cores that each of this machine's trainings has beside its own."""
-    trainings = int(os.environ.get("LOCAL_WORLD_SIZE", 1))  # as `accelerate launch` says
-    return min(max(joblib.cpu_count() // trainings - 1, 1), _MAX_WORKERS)
+    """Number of workers for training on a GPU: the cores per training process of this machine, less one."""
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", 1))  # set by `accelerate launch`
+    return min(max(joblib.cpu_count() // processes - 1, 1), _MAX_WORKERS)

@@ -1,45 +1,38 @@
 """The Dice loss and its combination over the two streams (paper, supplement, "Losses and Metrics")."""
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, distributed
 
 from zerobev.common.errors import InputError
 from zerobev.config import AUX
+from zerobev.models.base import MapLogits
 
-EPSILON = 1e-6  #: keeps the Dice ratio of an empty class finite
-
-
-class Predicted(Protocol):
-    """What a model returns: logits before the FOV mask."""
-
-    zero_logits: Tensor  #: (B, K, M, M)
-    aux_logits: Tensor | None  #: (B, A, M, M)
-    pooled: Tensor | None  #: (B, K, M, M) in [0, 1]
+_EPSILON = 1e-6  # keeps the Dice ratio of an empty class finite
 
 
 class Losses(NamedTuple):
     """Scalars of one batch."""
 
-    total: Tensor  #: what is minimised
-    main: Tensor  #: of the output that is evaluated; for Zero-BEV the zero-shot map
+    total: Tensor  #: the objective
+    main: Tensor  #: of the evaluated output; for Zero-BEV the zero-shot map
     aux: Tensor | None = None  #: of the auxiliary maps
 
 
 def dice_loss(probabilities: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """Soft Dice loss, averaged over classes (paper, supplement, "Losses").
 
-    Sums run over all images and cells of a class, so that images in which a class is rare or absent
-    weigh little. A class that the whole batch lacks costs 1 whatever is predicted, without gradient.
-    With several processes the sums run over the images of all of them: the loss, and the gradient once
-    DistributedDataParallel has averaged it, are those of one process with the whole batch.
+    Sums per class are over all images and cells, so images without the class, or with little of it, have little weight.
+    A class absent from the whole batch has loss 1 for any prediction, without gradient. With several processes the sums
+    are over the images of all processes: the loss, and the gradient after averaging by DistributedDataParallel, are
+    those of one process with the whole batch.
 
     probabilities: (B, K, M, M) in [0, 1]
     target: (B, K, M, M) in {0, 1}
-    mask: (B, 1, M, M) in {0, 1}; cells where it is 0 do not count
-    Returns a scalar float32 in [0, 1], also under autocast. Raises `InputError` where the shapes disagree.
+    mask: (B, 1, M, M) in {0, 1}; cells with 0 are left out
+    Returns a scalar float32 in [0, 1], also under autocast. Raises `InputError` if the shapes differ.
     """
     if probabilities.shape != target.shape:
         raise InputError(
@@ -50,21 +43,20 @@ def dice_loss(probabilities: Tensor, target: Tensor, mask: Tensor) -> Tensor:
         both = (truth * predicted).sum(dim=(0, 2, 3))  # K
         either = (truth + predicted).sum(dim=(0, 2, 3))  # K
         both, either = _over_processes(torch.stack((both, either)))
-        return 1 - (2 * both / (either + EPSILON)).mean()
+        return 1 - (2 * both / (either + _EPSILON)).mean()
 
 
 def zero_bev_loss(
-    predicted: Predicted, batch: Mapping[str, Tensor], alpha: float, aux: tuple[str, ...] = AUX
+    predicted: MapLogits, batch: Mapping[str, Tensor], alpha: float, aux: tuple[str, ...] = AUX
 ) -> Losses:
-    """Dice loss of the main maps, and of the auxiliary maps with weight `alpha` where the model has them.
+    """Weighted Dice losses: (1 - alpha) * main maps + alpha * auxiliary maps; main maps alone without auxiliary maps.
 
-    Where the model shows its maps before the U-Net, their loss is added to the total, with the weight of the main maps:
-    it reaches the geometry without a detour.
+    If the model returns maps before the U-Net, their loss is added with the weight of the main maps: its gradient
+    reaches the geometry directly.
 
-    predicted: logits (B, K, M, M) and, or None, (B, A, M, M), before the FOV mask
-    batch: `target` (B, K, M, M), `aux` (B, 2, M, M) in the order of `AUX` if the model predicts it, `fov` (B, 1, M, M)
-    alpha: weight of the auxiliary loss, in [0, 1]; without auxiliary maps the main loss stands alone
-    aux: names of the A maps that the model predicts, its `config.aux`
+    batch: `target` (B, K, M, M); `aux` (B, 2, M, M) in the order of `AUX`, for auxiliary maps; `fov` (B, 1, M, M)
+    alpha: in [0, 1]
+    aux: names of the auxiliary maps of the model, its `config.aux`
     """
     zero = dice_loss(predicted.zero_logits.float().sigmoid(), batch["target"], batch["fov"])
     minimised = zero
@@ -78,7 +70,7 @@ def zero_bev_loss(
 
 
 def _over_processes(sums: Tensor) -> Tensor:
-    """Sums over all processes; the gradient is scaled so that its mean over processes is the true one."""
+    """Sums over all processes; gradients are scaled so that their mean over processes is the true gradient."""
     if not distributed.is_initialized():
         return sums
     everywhere = sums.detach().clone()

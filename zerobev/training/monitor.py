@@ -1,4 +1,4 @@
-"""What a training looks like while it runs: pictures in its folder, renewed at every validation."""
+"""Pictures of a running training."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from zerobev.common.storage import replacing
 from zerobev.training.loader import model_inputs
 
-_SHOWN = 4  # samples of a batch
+_SAMPLES = 4  # shown, of a batch
 
 
 def write_picture(figure: Figure, path: Path) -> None:
@@ -20,7 +20,7 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 
 def curves_figure(curves: Mapping[str, Sequence[float | None]]) -> Figure:
-    """Training losses and validation scores over steps; columns as `training.train.History.curves` gives them."""
+    """Training losses and validation scores over steps; `curves` as from `training.history.columns`."""
     figure = Figure(figsize=(6, 3))
     axes = figure.subplots()
     for name, style in {"main": "-", "aux": "-", "validation": "o-"}.items():
@@ -33,14 +33,14 @@ def curves_figure(curves: Mapping[str, Sequence[float | None]]) -> Figure:
 
 
 def maps_figure(model: nn.Module, batch: Mapping[str, Tensor]) -> Figure:
-    """Samples of a batch, one a line: photograph, zero-shot image, predicted map, true map; of the first modality.
+    """Samples of a batch, one per row: RGB image, and zero-shot image, predicted map and true map of one modality.
 
-    It is drawn without `report.grid` and its pyplot, which would show it in the notebook that trains.
+    Drawn without pyplot, which would show the figure in a notebook.
 
-    model: returns a `MapLogits`; it is called as it is, in evaluation mode
+    model: returns a `MapLogits`; in evaluation mode
     batch: of `data.samples`, on the model's device
     """
-    some = {name: value[:_SHOWN] for name, value in batch.items()}
+    some = {name: value[:_SAMPLES] for name, value in batch.items()}
     with torch.no_grad():
         predicted = model(*model_inputs(some)).zero_logits.float().sigmoid()[:, 0] * some["fov"][:, 0]
     columns = {

@@ -1,10 +1,10 @@
-"""In which precision this machine computes forward passes."""
+"""Precision of forward passes."""
 
 import torch
 
 
 def computes_bfloat16(device: str) -> bool:
-    """Whether a device ("cpu" or "cuda") multiplies in bfloat16 itself; where it does not, that would be slower."""
+    """Whether a device ("cpu" or "cuda") multiplies in bfloat16 in hardware; emulation would be slower."""
     if device == "cuda":
         return torch.cuda.is_bf16_supported()
     capable = torch.cpu.get_capabilities()

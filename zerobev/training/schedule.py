@@ -1,4 +1,4 @@
-"""The learning rate over a training (paper, "Implementation and training details")."""
+"""The learning rate schedule (paper, "Implementation and training details")."""
 
 from typing import Any
 
@@ -8,11 +8,11 @@ from zerobev.config import TrainConfig
 
 
 class Schedule:
-    """The learning rate: linear warm-up, exponential decay, and halving on a plateau of the validation score.
+    """Linear warm-up, exponential decay, and halving on a plateau of the validation score.
 
-    Three factors on the configured rate. Step t < `warmup` has the factor (t + 1) / warmup; every `decay_every`
-    steps multiply by `decay`; and the first validation after `patience` of them without progress (a
-    score at least 0.01 % lower) halves the rate, as in torch's `ReduceLROnPlateau`.
+    These are three factors on the configured rate: (t + 1) / warmup for step t < `warmup`; `decay` every `decay_every`
+    steps; 1/2 at the first validation after `patience` validations without progress (a score at least 0.01 % lower), as
+    in torch's `ReduceLROnPlateau`.
     """
 
     def __init__(self, optimizer: Optimizer, config: TrainConfig) -> None:
@@ -22,16 +22,16 @@ class Schedule:
         self._plateau = lr_scheduler.ReduceLROnPlateau(optimizer, factor=0.5, patience=config.patience)
 
     def step(self) -> None:
-        """To be called after every step of the optimiser."""
+        """Advance by one step; call after every step of the optimiser."""
         for scheduler in self._steps:
             scheduler.step()
 
     def validated(self, score: float) -> None:
-        """To be called after every validation; lower is better."""
+        """Take the score of a validation; lower is better."""
         self._plateau.step(score)
 
     def state_dict(self) -> list[dict[str, Any]]:
-        """State of the three factors; the rate itself is part of the optimiser's state."""
+        """State of the three factors; the rate itself is in the optimiser's state."""
         return [scheduler.state_dict() for scheduler in (*self._steps, self._plateau)]
 
     def load_state_dict(self, states: list[dict[str, Any]]) -> None:

@@ -1,12 +1,12 @@
 """One training loop for every learned model, on a CPU or on GPUs (paper, "Implementation and training details").
 
-A step is a pure function of the state before it and of (seed, step): batches are drawn by their step, and
-torch's generator is seeded anew for every step. A run that is killed and started again therefore ends with
-the very weights of an unbroken one.
+A step is a pure function of the state before it and of (seed, step): batches are addressed by step, and torch's
+generator is seeded before every step. A run that is killed and resumed therefore has the same final weights as an
+uninterrupted one.
 
-Several processes (`accelerate launch`) share each batch of a step, and its size stays what is configured. They take
-the steps that one process takes, up to rounding, but for two things: dropout draws differ, and on a CPU a batch norm
-is that of a process's own samples (on GPUs it is that of all). The folder has to be one that all of them see.
+Several processes (`accelerate launch`) divide each batch; its total size stays as configured. Up to rounding, the steps
+are those of one process, with two exceptions: dropout differs, and on a CPU batch norms use the samples of one process
+(on GPUs those of all). All processes need access to the same folder.
 """
 
 import json
@@ -40,8 +40,8 @@ from zerobev.training.monitor import curves_figure, write_picture
 from zerobev.training.precision import computes_bfloat16
 from zerobev.training.schedule import Schedule
 
-CHECKPOINT_SECONDS = 60  #: between two checkpoints, beside those at validations
-HISTORY_ENTRIES = 200  #: about as many are kept per run, beside those at validations
+CHECKPOINT_SECONDS = 60  #: between two checkpoints, apart from those at validations
+HISTORY_ENTRIES = 200  #: approximate number per run, apart from validations
 
 Objective = Callable[[nn.Module, Batch], Losses]
 Picture = Callable[[nn.Module, Batch], Figure]
@@ -49,10 +49,7 @@ log = logging.getLogger("zerobev.train")
 
 
 def dice_objective(alpha: float, aux: tuple[str, ...] = AUX) -> Objective:
-    """The Zero-BEV loss of a model that is called as `model(rgb, zero, depth)` and returns a `MapLogits`.
-
-    aux: names of the auxiliary maps that the model predicts, if it predicts any; depth is given where a batch has it
-    """
+    """`zero_bev_loss` of a model called as `model(rgb, zero, depth)`, without depth if the batch has none."""
     return lambda model, batch: zero_bev_loss(model(*model_inputs(batch)), batch, alpha, aux)
 
 
@@ -68,23 +65,21 @@ def train(
     objective: Objective | None = None,
     picture: Picture | None = None,
     device: torch.device | str | None = None,
-    workers: int | None = None,
 ) -> History:
-    """Train `model` in place; it is left on the device, in evaluation mode, with the weights that validated best.
+    """Train `model` in place; afterwards it is on the device, in evaluation mode, with the best validated weights.
 
-    model: with its first weights, which the caller draws from the seed
-    validation: fixed batches. Their mean `main` loss is the score, lower is better: for Zero-BEV the Dice loss of
-        the zero-shot stream. Unlike an IoU it has no threshold, so that it moves early in training already,
-        and on *Synth* textures it needs no semantic label: the choice of weights stays zero-shot.
-    folder: receives `checkpoint.pt`, `best.safetensors` (at the end), `history.jsonl`, `train.log` and, renewed at
-        every validation, `curves.png` and `sample.png`
-    seed: of dropout; `data` has its own
-    key: names the run. A checkpoint with this key is taken up, one with another is an `InputError`, and one that
-        cannot be read is reported in the log and replaced.
-    objective: losses of a batch; by default `dice_objective(config.alpha)`
-    picture: draws what the model does with the first validation batch, for `sample.png`
-    device: default: a GPU if there is one. Forward passes are bfloat16 where the processor computes in it.
-    workers: processes that draw batches, as `training.loader.batches` takes them
+    model: with initial weights, drawn from the seed by the caller
+    validation: fixed batches; their mean `main` loss is the score, lower is better: for Zero-BEV the Dice loss of the
+        zero-shot stream. Unlike an IoU it has no threshold, so it changes from the start of training. On *Synth*
+        textures it needs no semantic label: the choice of weights stays zero-shot.
+    folder: for `checkpoint.pt`, `best.safetensors` (at the end), `history.jsonl`, `train.log`, and, at every
+        validation, `curves.png` and `sample.png`
+    seed: of dropout; `data` has another
+    key: name of the run. Training resumes from a checkpoint with this key. A checkpoint with another key raises
+        `InputError`; an unreadable one is reported in the log and replaced.
+    objective: losses of a batch; default: `dice_objective(config.alpha)`
+    picture: draws the first validation batch and the model's output, for `sample.png`
+    device: default: a GPU if there is one. Forward passes are in bfloat16 if the processor computes in it.
     """
     keep_freed_memory()
     accelerator = training_accelerator(device)
@@ -94,8 +89,9 @@ def train(
         run = _Run(model, config, folder, key, accelerator)
         try:
             run.resume()
-            place = accelerator.process_index, accelerator.num_processes
-            with closing(batches(data, range(run.step, config.steps), accelerator.device, place, workers)) as drawn:
+            steps = range(run.step, config.steps)
+            processes = accelerator.process_index, accelerator.num_processes
+            with closing(batches(data, steps, accelerator.device, *processes)) as drawn:
                 shown = progress(drawn, "training", "step", config.steps, done=run.step)
                 for batch in shown if accelerator.is_main_process else drawn:
                     torch.manual_seed(_step_seed(seed, run.step, accelerator.process_index))
@@ -113,11 +109,11 @@ def train(
 
 
 class _Run:
-    """Everything that changes during training, and its way to the disk and back."""
+    """State of a training, its checkpoints and its history."""
 
     def __init__(self, model: nn.Module, config: TrainConfig, folder: Path, key: str, accelerator: Accelerator) -> None:
         if accelerator.num_processes > 1 and accelerator.device.type == "cuda":
-            nn.SyncBatchNorm.convert_sync_batchnorm(model)  # in place; torch has it for GPUs alone
+            nn.SyncBatchNorm.convert_sync_batchnorm(model)  # in place; torch supports it only on GPUs
         self.bare = model
         self.config, self.folder, self.key, self.accelerator = config, folder, key, accelerator
         optimizer = torch.optim.Adam(
@@ -130,7 +126,7 @@ class _Run:
         self.best_step, self.best_score = 0, float("inf")
         self.entries: list[Entry] = []
         self.window: list[list[float]] = []  # losses since the last entry
-        self.unread: list[Tensor] = []  # the last of them, still on the device
+        self.unread: list[Tensor] = []  # later losses, still on the device
         self.learning_rate = config.learning_rate  # of the last step
         self._seconds_before, self._started = 0.0, time.monotonic()
         self._saved_at = self._started
@@ -149,16 +145,16 @@ class _Run:
         self.optimizer.zero_grad()
         self.schedule.step()
         self.step += 1
-        # read later: reading a GPU's result at every step would make it wait for the next one
+        # read later: reading a result at every step would stall a GPU
         self.unread.append(self._means(torch.stack([value.detach() for value in losses if value is not None])))
 
     def validate(self, objective: Objective, batches: Sequence[Batch]) -> None:
-        """Score the model, keep it if it is the best so far, and save a checkpoint."""
+        """Score the model, copy its weights if it is the best so far, and save a checkpoint."""
         self.model.eval()
-        rank, ranks = self.accelerator.process_index, self.accelerator.num_processes
+        rank, world_size = self.accelerator.process_index, self.accelerator.num_processes
         with torch.no_grad():
-            shares = ({name: value[rank::ranks] for name, value in batch.items()} for batch in batches)
-            scores = [objective(self.model, moved(share, self.accelerator.device)).main for share in shares]
+            parts = ({name: value[rank::world_size] for name, value in batch.items()} for batch in batches)
+            scores = [objective(self.model, moved(part, self.accelerator.device)).main for part in parts]
             score = float(np.mean(self._means(torch.stack(scores)).tolist()))
         self.schedule.validated(score)
         if score < self.best_score:
@@ -168,11 +164,11 @@ class _Run:
         self.save()
 
     def _means(self, values: Tensor) -> Tensor:
-        """Over processes: all of them have to keep the same weights, and lower the rate at the same step."""
+        """Means over processes, so that all choose the same weights and lower the rate at the same step."""
         return self.accelerator.reduce(values, reduction="mean")
 
     def show(self, picture: Picture | None, batch: Batch) -> None:
-        """Draw the curves so far, and what the model does with a batch."""
+        """Draw the curves so far, and the model's output on a batch."""
         if not self.accelerator.is_main_process:
             return
         write_picture(curves_figure(columns(self.entries)), self.folder / "curves.png")
@@ -180,7 +176,7 @@ class _Run:
             write_picture(picture(self.bare, moved(batch, self.accelerator.device)), self.folder / "sample.png")
 
     def read_losses(self) -> None:
-        """Move the losses of the last steps into the window; a `FloatingPointError` if one is not finite."""
+        """Move the losses of the last steps into the window. Raises `FloatingPointError` if one is not finite."""
         if not self.unread:
             return
         first = self.step - len(self.unread) + 1
@@ -204,12 +200,12 @@ class _Run:
         log.info("step %d of %d, %.0f s: loss %.4f%s", self.step, self.config.steps, self.seconds, total, validated)
 
     def checkpoint_if_due(self) -> None:
-        """Save when the last checkpoint is old."""
+        """Save if the last checkpoint is older than `CHECKPOINT_SECONDS`."""
         if time.monotonic() - self._saved_at > CHECKPOINT_SECONDS:
             self.save()
 
     def save(self) -> None:
-        """Write the checkpoint, whole or not at all."""
+        """Write the checkpoint atomically."""
         self.read_losses()
         self._saved_at = time.monotonic()
         if not self.accelerator.is_main_process:
@@ -231,7 +227,7 @@ class _Run:
             torch.save(state, temporary)
 
     def resume(self) -> None:
-        """Take up the folder's checkpoint if there is one, and begin the history's file."""
+        """Load the folder's checkpoint if there is one, and rewrite the history's file."""
         state = _read_checkpoint(self.folder / "checkpoint.pt", self.key)
         if state is not None:
             self.bare.load_state_dict(state["model"])
@@ -257,11 +253,11 @@ class _Run:
 
 
 def _read_checkpoint(path: Path, key: str) -> dict[str, Any] | None:
-    """The checkpoint, or None if there is none that can be read."""
+    """The checkpoint; None if it is missing or unreadable."""
     if not path.exists():
         return None
     try:
-        with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums
+        with zipfile.ZipFile(path) as archive:  # torch does not verify checksums
             damaged = archive.testzip()
         if damaged:
             raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
@@ -280,26 +276,24 @@ def _step_seed(seed: int, step: int, rank: int) -> int:
 
 
 def training_accelerator(device: torch.device | str | None = None) -> Accelerator:
-    """An accelerator on the given device, or on a GPU if there is one; in bfloat16 if the device computes in it.
+    """An accelerator on the given device (default: a GPU if there is one), in bfloat16 if the device computes in it.
 
-    Raises `InputError` for a device that this machine does not have.
+    Raises `InputError` for a device missing on this machine.
     """
-    wish = None if device is None else torch.device(device).type
-    on_gpu = torch.cuda.is_available() and wish != "cpu"
-    kind = "cuda" if on_gpu else "cpu"
-    bfloat16 = computes_bfloat16(kind)
+    wanted = None if device is None else torch.device(device).type
+    kind = "cuda" if torch.cuda.is_available() and wanted != "cpu" else "cpu"
     if PartialState._shared_state and not distributed.is_initialized() and PartialState().device.type != kind:
-        # accelerate keeps the device of its first use in a process
+        # accelerate otherwise stays on the first device used by the process
         AcceleratorState._reset_state(reset_partial_state=True)
-    accelerator = Accelerator(cpu=not on_gpu, mixed_precision="bf16" if bfloat16 else "no")
-    if wish not in (None, accelerator.device.type):
-        raise InputError(f"device: expected {accelerator.device.type}, the one at hand, found {wish}")
+    accelerator = Accelerator(cpu=kind == "cpu", mixed_precision="bf16" if computes_bfloat16(kind) else "no")
+    if wanted not in (None, accelerator.device.type):
+        raise InputError(f"device: expected {accelerator.device.type}, the one at hand, found {wanted}")
     return accelerator
 
 
 @contextmanager
 def _logged(path: Path, main: bool) -> Iterator[None]:
-    """Send the log of the main process to `path`, too."""
+    """Also write the log of the main process to `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handler = logging.FileHandler(path) if main else logging.NullHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))

@@ -1,4 +1,4 @@
-"""Failures of one input of many, and errors of the machine."""
+"""Failures of one input among many, and errors of the machine."""
 
 import errno
 import gc
@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from zerobev.common.errors import InputError, SetupError, attempt
+from zerobev.common.errors import InputError, SetupError, attempt, first_line
 
 
 def failing(error: BaseException) -> object:
@@ -28,10 +28,10 @@ def failing(error: BaseException) -> object:
         (RecursionError("too deep"), "RecursionError: too deep"),
     ],
 )
-def test_every_failure_of_an_input_is_its_own(error, message):
+def test_a_failure_of_one_input_becomes_an_input_error_of_one_line(error, message):
     found = failing(error)
     assert type(found) is InputError and str(found) == message
-    assert str(pickle.loads(pickle.dumps(found))) == message  # as it comes from a worker
+    assert str(pickle.loads(pickle.dumps(found))) == message  # as returned by a worker process
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_failures_of_all_inputs_are_raised(error):
     assert raised.value is error
 
 
-def test_the_result_is_passed_on():
+def test_the_result_is_returned():
     assert attempt(lambda: 3) == 3
 
 
@@ -60,3 +60,8 @@ def test_a_failure_does_not_keep_the_input_in_memory():
     found = attempt(work)
     gc.collect()
     assert isinstance(found, InputError) and alive[0]() is None
+
+
+def test_the_first_line_of_an_error_or_its_type():
+    assert first_line(OSError("no such model\nsee the manual")) == "no such model"
+    assert first_line(RuntimeError()) == "RuntimeError"

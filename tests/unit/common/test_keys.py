@@ -1,4 +1,4 @@
-"""Keys depend on values that differ from their defaults, and on nothing else."""
+"""Keys depend only on values that differ from their defaults."""
 
 from dataclasses import dataclass, field, make_dataclass, replace
 
@@ -23,7 +23,7 @@ class Outer:
     more: Inner = field(default_factory=lambda: Inner(7))
 
 
-def test_values_that_have_their_default_are_left_out():
+def test_default_values_are_left_out():
     assert changed(Outer(Inner(3))) == {"inner": {"size": 3}}
     assert changed(Outer(Inner(3, 2.0), ("a",))) == {"inner": {"size": 3, "gain": 2.0}, "names": ["a"]}
     assert plain(Outer(Inner(3)))["more"] == {"size": 7, "gain": 1.0}
@@ -31,8 +31,8 @@ def test_values_that_have_their_default_are_left_out():
         plain({"a": object()})
 
 
-def test_every_dataclass_of_a_scale_may_grow_without_a_new_key():
-    """A field with a default is added to each; keys stay, and a record of before matches."""
+def test_new_fields_with_defaults_change_no_key():
+    """With a new field in every dataclass of a scale, keys are the same and earlier records match."""
 
     def grown(value):
         kind = make_dataclass("Grown", [("new", int, field(default=3))], bases=(type(value),), frozen=True)
@@ -46,7 +46,7 @@ def test_every_dataclass_of_a_scale_may_grow_without_a_new_key():
 
 
 @given(st.integers(), st.floats(allow_nan=False), st.lists(st.text(max_size=3), max_size=3))
-def test_stored_data_match_the_value_they_come_from_and_no_other(size, gain, names):
+def test_stored_data_match_only_their_own_value(size, gain, names):
     value = Outer(Inner(size, gain), tuple(names))
     assert matches(plain(value), value)
     assert matches({"run": plain(value)}, {"run": value}) and not matches({"run": plain(value)}, {"walk": value})

@@ -1,4 +1,4 @@
-"""Memory that a process frees and takes again."""
+"""Memory that a process frees and allocates again."""
 
 import platform
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 from support.paths import ROOT
 
 ROUNDS, BLOCK = 10, 30 * 2**20
-PAGES = 3 * BLOCK // 4096  # of a round
+PAGES = 3 * BLOCK // 4096  # per round
 CHURN = f"""
 import resource
 import numpy as np
@@ -31,8 +31,8 @@ print(churn())
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator is glibc's")
-def test_freed_blocks_are_not_faulted_in_again():
-    # numpy would ask for huge pages, of which fewer are faulted in
+def test_reused_blocks_cause_no_page_faults():
+    # with huge pages, NumPy would cause fewer page faults
     env = {"NUMPY_MADVISE_HUGEPAGE": "0", "PYTHONPATH": str(ROOT)}
     ended = subprocess.run([sys.executable, "-c", CHURN], env=env, capture_output=True, text=True, check=True)
     default, keeping = map(int, ended.stdout.split())

@@ -1,4 +1,4 @@
-"""The folder of data and reports, for a checkout, an installed package and a choice of the user."""
+"""The folder of data and reports: for a checkout, for an installed package, and as chosen by the user."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -15,7 +15,7 @@ from zerobev.report.notebooks import kernel_settings
 from support.paths import ROOT
 
 
-def test_a_checkout_keeps_its_data_whatever_the_working_folder(monkeypatch, tmp_path):
+def test_a_checkout_contains_its_data_for_every_working_folder(monkeypatch, tmp_path):
     monkeypatch.delenv("ZEROBEV_HOME", raising=False)
     monkeypatch.chdir(tmp_path)
     assert zerobev_home() == ROOT
@@ -44,7 +44,7 @@ def test_the_users_choice_comes_first_and_reaches_kernels_as_an_absolute_path(mo
     assert zerobev_home() == Path.home().resolve() / "data"
 
 
-def test_a_file_is_no_home(monkeypatch, tmp_path):
+def test_a_file_is_refused(monkeypatch, tmp_path):
     (tmp_path / "data").touch()
     monkeypatch.setenv("ZEROBEV_HOME", str(tmp_path / "data"))
     with pytest.raises(InputError, match=r"ZEROBEV_HOME: expected a folder, found a file at .*data"):

@@ -1,4 +1,4 @@
-"""Settings from text: each value has its type, and an unknown name is one clear error."""
+"""Settings from text: values have the right type; unknown names and wrong types are clear errors."""
 
 import re
 
@@ -40,7 +40,7 @@ def test_values_of_every_type():
         ("camera.hfov_deg=180", "hfov_deg: expected more than 0 and less than 180, found 180"),
     ],
 )
-def test_unknown_names_and_other_types_are_refused(setting, message):
+def test_unknown_names_and_wrong_types_are_refused(setting, message):
     with pytest.raises(InputError, match=message) as caught:
         changed_by(REDUCED, [setting])
     assert re.search(re.escape(setting.partition("=")[0]), str(caught.value))

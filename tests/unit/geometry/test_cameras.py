@@ -35,7 +35,7 @@ def test_axes_at_known_headings(yaw, right, forward):
         assert rotation == pytest.approx(np.column_stack(axes), abs=1e-12)
 
 
-def test_pinhole_is_above_the_point_of_the_floor():
+def test_pinhole_is_above_the_point_on_the_floor():
     camera = CameraConfig(fpv_px=8, bev_px=8, height_m=1.1)
     assert Pose(2, -3, 2.6, 0.4).centre(camera) == pytest.approx([2, -3, 3.7])
 
@@ -46,7 +46,7 @@ def test_rays_have_unit_depth_and_span_the_field_of_view(camera):
     rays = fpv_rays(camera)
     assert rays.shape == (camera.fpv_px, camera.fpv_px, 3)
     assert (rays[..., 2] == 1).all()
-    # half a pixel beyond the centre of the last one is the edge of the image, at half the field of view
+    # half a pixel beyond the last centre is the edge of the image, at half the field of view
     edge = rays[0, -1, 0] + 0.5 / camera.focal_px
     assert math.degrees(math.atan(edge)) == pytest.approx(camera.hfov_deg / 2)
     assert rays == pytest.approx(-rays[::-1, ::-1] * (1, 1, -1), abs=1e-12)  # the axis is in the middle

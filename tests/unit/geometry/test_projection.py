@@ -18,7 +18,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def pixels_of(point: tuple[float, float, float], camera: CameraConfig) -> torch.Tensor:
-    """Depth image of one point (right, forward, up on the map): its pixel alone has a depth."""
+    """Depth image of one point (right, forward, up in the map frame); other pixels have no depth."""
     right, forward, up = point
     column = int(np.floor(right / forward * camera.focal_px + camera.fpv_px / 2))
     row = int(np.floor((camera.height_m - up) / forward * camera.focal_px + camera.fpv_px / 2))
@@ -31,7 +31,7 @@ def pixels_of(point: tuple[float, float, float], camera: CameraConfig) -> torch.
 @given(st.floats(-3, 3), st.floats(0.3, 6), st.floats(-0.5, 3))
 @settings(max_examples=200)
 def test_a_point_lands_in_its_cell(right, forward, up):
-    camera = CameraConfig(fpv_px=301, bev_px=20)  # fine pixels: their centres are almost the point
+    camera = CameraConfig(fpv_px=301, bev_px=20)  # fine pixels: their centres are close to the point
     depth = pixels_of((right, forward, up), camera)
     slack = forward / camera.focal_px
     cell = camera.cell_m
@@ -49,7 +49,7 @@ def test_a_point_lands_in_its_cell(right, forward, up):
 
 
 def test_points_by_hand():
-    """The pixel right below the middle of an image of 90 degrees, at 2 m."""
+    """Pixels of a 2 x 2 image of 90 degrees, at 2 m and at 2.5 m."""
     camera = CameraConfig(fpv_px=2, bev_px=5, hfov_deg=90)
     points = map_points(torch.full((2, 2), 2.0), camera)
     assert points[1, 1].tolist() == pytest.approx([1, 2, 0.88 - 1])
@@ -59,7 +59,7 @@ def test_points_by_hand():
 
 
 def random_view(seed: int, camera: CameraConfig, batch: int = 2, modalities: int = 3):
-    """Values and depths like those of a room: a wall at a random distance, holes, and random masks."""
+    """Values and depths as in a room: a wall at a random distance, holes, and random masks."""
     rng = np.random.default_rng(seed)
     shape = (batch, 1, camera.fpv_px, camera.fpv_px)
     depth = rng.uniform(0.5, 8, (batch, 1, 1, 1)) * rng.uniform(0.8, 1.2, shape) * (rng.random(shape) < 0.9)
@@ -68,7 +68,7 @@ def random_view(seed: int, camera: CameraConfig, batch: int = 2, modalities: int
 
 
 def voxel_projection(zero: np.ndarray, depth: np.ndarray, camera: CameraConfig, side: int) -> np.ndarray:
-    """The paper's way: count white points in side x side x 100 voxels, sum over height, threshold at zero."""
+    """As in the paper: count white points in side x side x 100 voxels, sum over height, threshold at zero."""
     batch, modalities, height, width = zero.shape
     levels = 100
     maps = np.zeros((batch, modalities, side, side), bool)
@@ -84,7 +84,7 @@ def voxel_projection(zero: np.ndarray, depth: np.ndarray, camera: CameraConfig, 
                     up = camera.height_m - (i + 0.5 - height / 2) * z / camera.focal_px
                     column = int(np.floor((right + camera.bev_extent_m / 2) / camera.bev_extent_m * side))
                     row = int(np.floor((camera.bev_extent_m - z) / camera.bev_extent_m * side))
-                    # the lowest voxel takes what lies below the floor
+                    # points below the floor count in the lowest voxel
                     level = max(int(np.floor(up / camera.max_height_m * levels)), 0)
                     if 0 <= column < side and 0 <= row < side and level < levels:
                         voxels[row, column, level] += 1
@@ -94,7 +94,7 @@ def voxel_projection(zero: np.ndarray, depth: np.ndarray, camera: CameraConfig, 
 
 @given(SEEDS)
 @settings(max_examples=10)
-def test_projection_is_counting_in_voxels(seed):
+def test_projection_equals_counting_in_voxels(seed):
     zero, depth = random_view(seed, CAMERA)
     voxels = voxel_projection(zero.numpy(), depth.numpy(), CAMERA, side=20)
     assert np.array_equal(inverse_project(zero, depth, CAMERA).numpy(), voxels)
@@ -102,8 +102,8 @@ def test_projection_is_counting_in_voxels(seed):
 
 @given(SEEDS)
 @settings(max_examples=5)
-def test_voxels_of_five_centimetres_make_no_difference_where_cells_are_whole_voxels(seed):
-    """100^3 voxels, pooled to the map: equal at 20 x 20; at 40 x 40 those that lie within a cell agree."""
+def test_voxels_of_five_centimetres_give_the_same_map_if_cells_are_whole_voxels(seed):
+    """100^3 voxels, pooled to the map: equal at 20 x 20; at 40 x 40, voxels within one cell agree."""
     zero, depth = random_view(seed, CAMERA)
     fine = voxel_projection(zero.numpy(), depth.numpy(), CAMERA, side=100)
     pooled = fine.reshape(2, 3, 20, 5, 20, 5).max(axis=(3, 5))
@@ -118,12 +118,12 @@ def test_voxels_of_five_centimetres_make_no_difference_where_cells_are_whole_vox
         for column in np.flatnonzero(whole):
             cell = pooled[..., int(cell_of_voxel[row]), int(cell_of_voxel[column])]
             np.maximum(cell, fine[..., row, column], out=cell)
-    assert (pooled <= direct).all()  # what lies in whole voxels is there
+    assert (pooled <= direct).all()  # points in such voxels are on the map
 
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_the_projection_of_one_mask_is_that_of_an_image(seed):
+def test_the_projection_of_one_mask_equals_that_of_an_image(seed):
     zero, depth = random_view(seed, CAMERA)
     mask = zero[0, 0] > 0
     expected = inverse_project(mask[None, None].double(), depth[:1], CAMERA)[0, 0].numpy()
@@ -134,7 +134,7 @@ def test_the_projection_of_one_mask_is_that_of_an_image(seed):
 @given(SEEDS)
 @settings(max_examples=20)
 def test_projection_is_a_maximum(seed):
-    """Commutes with scaling, is monotone, and of two images' larger values gives the larger of their maps."""
+    """It commutes with scaling and with the maximum of two images, and is monotone."""
     zero, depth = random_view(seed, CAMERA)
     generator = torch.Generator().manual_seed(seed)
     a, b = zero * torch.rand(zero.shape, generator=generator), torch.rand(zero.shape, generator=generator).double()
@@ -154,7 +154,7 @@ def test_pixels_without_depth_reach_no_cell():
 @given(SEEDS)
 @settings(max_examples=20)
 def test_field_of_view_is_the_convex_hull_of_the_cells(seed):
-    """scikit-image takes the hull of the pixels' edges' middles, ours that of their corners: a border's difference."""
+    """scikit-image takes the hull of the middles of pixel edges, ours that of corners: they differ at the border."""
     depth = random_view(seed, CAMERA)[1][0, 0].numpy()
     reached = np.zeros(NOWHERE + 1, bool)
     reached[cells_of_pixels(torch.from_numpy(depth), CAMERA).numpy()] = True
@@ -167,7 +167,7 @@ def test_field_of_view_is_the_convex_hull_of_the_cells(seed):
     theirs = convex_hull_image(cells)
     assert (mask | ~theirs).all()
     rows, columns = np.nonzero(mask & ~theirs)
-    for row, column in zip(rows, columns):  # what ours has more touches theirs
+    for row, column in zip(rows, columns):  # additional cells of ours touch theirs
         assert theirs[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].any()
     assert (mask & ~theirs).sum() <= 0.1 * mask.sum() + 4
 
@@ -180,8 +180,8 @@ def test_field_of_view_of_one_cell_and_of_two():
     assert np.argwhere(fov_mask(two, camera)).tolist() == [[row, 12] for row in range(4, 10)]
 
 
-def test_field_of_view_of_open_ground_is_the_cone_of_the_lens():
-    """On an endless floor the mask is the trapezium between the lens' edges, from the first row that sees floor."""
+def test_field_of_view_on_an_infinite_floor_is_a_trapezium():
+    """On an infinite floor the mask is the trapezium between the edges of the view, from the first row with floor."""
     camera = CameraConfig(fpv_px=400, bev_px=50)
     down = (np.arange(400) + 0.5 - 200) / camera.focal_px
     depth = np.where(down > 0, camera.height_m / np.where(down > 0, down, 1), 0)

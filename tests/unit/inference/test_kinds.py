@@ -1,4 +1,4 @@
-"""Masks, labels, probabilities: explicit kinds, and plain arrays where they leave one reading."""
+"""Masks, labels, probabilities: explicit kinds, and plain arrays of an unambiguous kind."""
 
 import io
 
@@ -61,14 +61,14 @@ def test_labels_become_masks_and_values_their_level_sets():
         lambda m: m.tolist(),
     ],
 )
-def test_masks_mean_the_same_in_every_usual_type(code):
+def test_masks_are_the_same_in_every_common_type(code):
     np.testing.assert_array_equal(seen(Masks(code(MASK))), MASK[None])
     np.testing.assert_array_equal(seen(Masks(code(STACK))), STACK)
     np.testing.assert_array_equal(seen(Masks(code(np.moveaxis(STACK, 0, -1)))), STACK)
     np.testing.assert_array_equal(seen(Masks([code(mask) for mask in STACK])), STACK)
 
 
-def test_a_mask_after_jpeg_is_cut_at_half():
+def test_a_mask_after_jpeg_is_thresholded_at_one_half():
     row, column = np.mgrid[:160, :240]
     disc = np.hypot(row - 70, column - 90) < 45
     noisy = jpeg(disc)
@@ -77,7 +77,7 @@ def test_a_mask_after_jpeg_is_cut_at_half():
 
 
 @pytest.mark.parametrize("axis", ["first", "last"])
-def test_channels_are_where_they_are_said_to_be(axis):
+def test_channels_are_first_or_last_as_given(axis):
     values = np.random.default_rng(0).random((6, 6, 6))
     first = values if axis == "first" else np.moveaxis(values, -1, 0)
     np.testing.assert_array_equal(
@@ -92,7 +92,7 @@ def test_channels_are_where_they_are_said_to_be(axis):
         np.testing.assert_array_equal(seen(kind_of(given_, SHAPE)), seen(Probabilities(softmax, channels="last")))
 
 
-def test_pixels_without_a_label_become_no_map():
+def test_pixels_without_a_class_have_no_map():
     (images,) = Labels(VOC, ignore=255).layers(SHAPE)
     assert images.labels == ("0", "7")
     (images,) = Labels(VOC).layers(SHAPE)
@@ -120,7 +120,7 @@ def test_pixels_without_a_label_become_no_map():
         (MASK.astype(np.float16), Probabilities),
     ],
 )
-def test_an_array_with_one_reading_is_that_kind(array, kind):
+def test_an_unambiguous_array_has_that_kind(array, kind):
     found = kind_of(array, SHAPE)
     assert type(found) is kind
     np.testing.assert_array_equal(seen(found), seen(kind(array)))
@@ -129,23 +129,23 @@ def test_an_array_with_one_reading_is_that_kind(array, kind):
 @pytest.mark.parametrize(
     ("array", "message"),
     [
-        (MASK.astype(int), r"a mask or a label map in integers from 0 to 1: say Masks\(array\), or Labels\(array\)"),
+        (MASK.astype(int), r"a mask or a label map in integers from 0 to 1: use Masks\(array\), or Labels\(array\)"),
         (MASK.astype(np.uint8) * 255, r"a mask or a label map in integers from 0 to 255"),
         (np.zeros(SHAPE, np.uint8), "a mask or a label map"),
         (np.full(SHAPE, 255, np.uint8), "a mask or a label map"),
         (np.where(MASK, 252, 2).astype(np.uint8), "a mask or a label map"),
-        (VOC, r"say Labels\(array, ignore=255\), or Labels\(array\)"),
+        (VOC, r"use Labels\(array, ignore=255\), or Labels\(array\)"),
         (np.zeros((*SHAPE, 2), np.float32), r"found flow or probabilities in .*Flow\.of\(array\)"),
         (np.zeros((*SHAPE, 3), np.uint8), r"found a colour image or 3 images in"),
-        (np.zeros((*SHAPE, 4), bool), r"say Masks\(array, channels='last'\) for 4 images"),
-        (np.zeros((*SHAPE, 3)), r"say Probabilities\(array, channels='last'\)"),
-        (Image.new("L", (30, 20)), r"found an image file: say Masks\.read"),
-        ([Image.new("1", (30, 20))] * 2, r"found an image file: say Masks\.read"),
-        ("mask.png", r"found an image file: say Masks\.read"),
+        (np.zeros((*SHAPE, 4), bool), r"use Masks\(array, channels='last'\) for 4 images"),
+        (np.zeros((*SHAPE, 3)), r"use Probabilities\(array, channels='last'\)"),
+        (Image.new("L", (30, 20)), r"found an image file: use Masks\.read"),
+        ([Image.new("1", (30, 20))] * 2, r"found an image file: use Masks\.read"),
+        ("mask.png", r"found an image file: use Masks\.read"),
         (np.ma.masked_less(CLASSES, 2), "found one with masked values"),
     ],
 )
-def test_an_array_with_two_readings_is_refused_and_they_are_named(array, message):
+def test_an_ambiguous_array_is_refused_with_the_possible_kinds(array, message):
     with pytest.raises(InputError, match=f"^modality: .*{message}"):
         kind_of(array, SHAPE)
 
@@ -170,7 +170,7 @@ def test_names_decide_between_a_mask_and_labels():
         (lambda: kind_of(None, (2, 3)), r"found object"),
         (
             lambda: kind_of(np.zeros((3, 2), bool), (2, 3)),
-            r"rows and columns are swapped, or the phot",
+            r"rows and columns are swapped, or only the phot",
         ),
         (lambda: Masks(CLASSES), r"found 6 grey levels from 0 to 5; is it a label map\?"),
         (lambda: Masks(np.where(MASK, 1.0, 0.3)), r"found 2 grey levels from 0.3 to 1"),
@@ -179,7 +179,7 @@ def test_names_decide_between_a_mask_and_labels():
         (lambda: Probabilities(CLASSES), r"expected probabilities in floating point, found int64"),
     ],
 )
-def test_what_a_kind_cannot_be_is_refused(make, message):
+def test_invalid_values_of_a_kind_are_refused(make, message):
     with pytest.raises(InputError, match=f"^modality: .*{message}"):
         kind = make()
         kind.layers(SHAPE if np.shape(kind.values)[0] == SHAPE[0] else (2, 3))
@@ -191,7 +191,7 @@ def test_a_label_without_a_name_is_refused():
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["i1", "u1", "i2", "u2", "i8"]))
-def test_a_label_map_is_taken_whole_or_refused(seed, dtype):
+def test_a_label_map_is_complete_in_its_images(seed, dtype):
     rng = np.random.default_rng(seed)
     array = rng.choice([0, 1, 2, 3, 40, 100, 127], SHAPE).astype(dtype)
     (images,) = kind_of(array, SHAPE).layers(SHAPE)

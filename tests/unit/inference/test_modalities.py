@@ -1,4 +1,4 @@
-"""Modalities as binary images and back: resampling against a closed form, boxes and flow by hand, objects that move."""
+"""Modalities as binary images and back: resampling against a closed form, boxes and flow by hand, moved objects."""
 
 import json
 import struct
@@ -33,17 +33,17 @@ CAMERA = CameraConfig(fpv_px=64, bev_px=40)
 
 
 def scene_of_rays(width: int, height: int, hfov_deg: float) -> np.ndarray:
-    """What a pinhole camera sees of a world whose colour is an affine function of the ray, (H, W, 3)."""
+    """(H, W, 3) image of a pinhole camera in a world with colours affine in the ray."""
     focal = width / 2 / np.tan(np.radians(hfov_deg) / 2)
     x, y = np.meshgrid(*((np.arange(length) + 0.5 - length / 2) / focal for length in (width, height)))
     return np.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 + 0.1 * (x - y)], axis=-1)
 
 
 @pytest.mark.parametrize(("width", "height", "hfov"), [(64, 64, 79), (640, 480, 95), (301, 233, 60), (90, 200, 79)])
-def test_a_photograph_of_any_camera_is_what_the_network_s_camera_would_see(width, height, hfov):
+def test_a_resampled_photograph_is_that_of_the_network_s_camera(width, height, hfov):
     view = PinholeView((height, width), hfov, CAMERA)
     expected = scene_of_rays(64, 64, 79)
-    # a pixel counts as covered from its middle on
+    # a pixel is covered if its middle is
     focal = width / 2 / np.tan(np.radians(hfov) / 2)
     ray = np.abs((np.arange(64) + 0.5 - 32) / CAMERA.focal_px)
     covered = (ray[:, None] <= height / 2 / focal + 1e-9) & (ray <= width / 2 / focal + 1e-9)
@@ -52,8 +52,8 @@ def test_a_photograph_of_any_camera_is_what_the_network_s_camera_would_see(width
     rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
     clipped = np.ix_(np.clip(range(64), rows[0], rows[-1]), np.clip(range(64), columns[0], columns[-1]))
     assert photograph.dtype == np.float32
-    np.testing.assert_array_equal(photograph, photograph[clipped])  # beyond the border its colours go on
-    # a pixel of the smaller of the two is what the border may be off by
+    np.testing.assert_array_equal(photograph, photograph[clipped])  # extended with the colours at the border
+    # the border may be off by the larger pixel of the two cameras
     slack = 0.3 * max(1 / CAMERA.focal_px, 1 / focal)
     assert np.abs(photograph - expected)[covered].max() < slack
     inner = covered & np.roll(covered, (1, 1), (0, 1)) & np.roll(covered, (-1, -1), (0, 1))
@@ -71,13 +71,13 @@ def test_whole_factors_are_exact(seed, factor):
 
 
 @given(st.integers(0, 630), st.booleans())
-def test_a_line_of_half_a_pixel_survives_wherever_it_lies_and_nothing_in_view_gets_lost(place, upright):
+def test_lines_of_half_a_pixel_are_kept_whole_and_thinner_ones_in_part(left, upright):
     view = PinholeView((640, 640), 79, CAMERA)
-    for width, least in ((5, 64), (1, 1)):
+    for width, min_px in ((5, 64), (1, 1)):
         image = np.zeros((640, 640), bool)
-        image[:, place : place + width] = True
+        image[:, left : left + width] = True
         found = view.mask(image if upright else image.T)
-        assert found.sum() >= least and (found if upright else found.T).all(axis=0).any()
+        assert found.sum() >= min_px and (found if upright else found.T).all(axis=0).any()
     assert not view.mask(np.zeros((640, 640), bool)).any()
 
 
@@ -92,7 +92,7 @@ def test_edges_grow_by_a_quarter_of_a_pixel():
 
 
 @pytest.mark.parametrize("hfov", [0, 180, -3, float("nan"), 0.1])
-def test_a_field_of_view_that_is_none_is_refused(hfov):
+def test_impossible_fields_of_view_are_refused(hfov):
     with pytest.raises(InputError, match=r"hfov_deg: expected"):
         PinholeView((48, 48), hfov, CAMERA)
 
@@ -103,13 +103,13 @@ def test_a_field_of_view_that_is_none_is_refused(hfov):
 def test_boxes_are_filled_between_their_corners(tmp_path):
     (tmp_path / "boxes.csv").write_text("label,score,xmin,ymin,xmax,ymax\nchair,0.75,1,0,3,2\nplant,0.5,-2,2.6,1,9\n")
     boxes = Boxes.read_csv(tmp_path / "boxes.csv")
-    images = boxes.images((4, 5))
+    (images,) = boxes.layers((4, 5))
     chair, plant = images.images
     assert images.labels == ("chair", "plant") and images.scores.tolist() == [0.75, 0.5]
     assert np.argwhere(chair).tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
     assert np.argwhere(plant).tolist() == [[3, 0]]
     with pytest.raises(InputError, match=r"expected box 0 within 1 x 3 pixels, found 1, 0, 3, 2"):
-        boxes.images((3, 1))  # they belong to a larger photograph
+        boxes.layers((3, 1))
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_boxes_in_other_formats_are_the_same_boxes(values, form, size):
         (lambda: Boxes.of([1, 2, 3, 4], ["a"]), r"expected numbers \(N, 4\), found int64 \(4,\)"),
     ],
 )
-def test_boxes_in_a_format_that_was_not_said_are_refused(make, message):
+def test_boxes_in_another_format_than_stated_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
@@ -154,12 +154,12 @@ def test_boxes_in_a_format_that_was_not_said_are_refused(make, message):
         ({"xmin": [1], "ymin": [0], "xmax": [3], "ymax": [2], "label": ["a"], "score": [2]}, r"scores in \[0, 1\]"),
     ],
 )
-def test_tables_that_are_none_of_boxes_are_refused(table, message):
+def test_tables_without_valid_boxes_are_refused(table, message):
     with pytest.raises(InputError, match=message):
         Boxes.from_table(pd.DataFrame(table))
 
 
-def test_rendered_boxes_enclose_their_instances_until_they_are_spoilt():
+def test_rendered_boxes_enclose_their_instances_without_noise():
     instance = np.zeros((40, 50), int)
     instance[5:15, 10:30], instance[20:40, 0:9], instance[0, 0] = 3, 4, 5
     names = {3: "bed", 4: "chair", 5: "tv"}
@@ -167,11 +167,11 @@ def test_rendered_boxes_enclose_their_instances_until_they_are_spoilt():
     assert exact.labels == ("bed", "chair") and exact.corners.tolist() == [[10, 5, 30, 15], [0, 20, 9, 40]]
     assert exact.scores.tolist() == [1, 1] and "rendered" in exact.source
     rng = np.random.default_rng(1)
-    spoilt = [rendered_boxes(instance, {3: "bed"}, rng, jitter=0.1, misses=0.25) for _ in range(400)]
-    corners = np.concatenate([boxes.corners for boxes in spoilt])
+    noisy = [rendered_boxes(instance, {3: "bed"}, rng, jitter=0.1, misses=0.25) for _ in range(400)]
+    corners = np.concatenate([boxes.corners for boxes in noisy])
     assert len(corners) == pytest.approx(300, abs=30)
     np.testing.assert_allclose(corners.std(axis=0), [2, 1, 2, 1], rtol=0.15)
-    scores = np.concatenate([boxes.scores for boxes in spoilt])
+    scores = np.concatenate([boxes.scores for boxes in noisy])
     assert 0.5 < scores.mean() < 0.95 and scores.max() <= 1
 
 
@@ -211,16 +211,15 @@ def test_a_detector_from_a_folder_gives_boxes_in_pixels_of_the_photograph(tmp_pa
 # --- flow ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["tvl1", "ilk"])
-def test_flow_points_from_the_first_frame_to_the_second(method):
+def test_flow_points_from_the_first_frame_to_the_second():
     y, x = np.mgrid[:64, :64]
     frames = [np.sin(0.3 * (x - dx))[..., None] * np.cos(0.23 * (y - dy))[..., None] for dx, dy in ((0, 0), (2, 1))]
     first, second = (np.repeat(0.5 + 0.5 * frame, 3, axis=2) for frame in frames)
-    field = flow_field(first, second, method)
+    field = flow_field(first, second)
     assert np.median(field[10:-10, 10:-10], axis=(0, 1)) == pytest.approx([2, 1], abs=0.3)
 
 
-def test_vectors_are_on_a_grid_where_something_moves():
+def test_vectors_are_at_moving_points_of_a_grid():
     field = np.zeros((40, 60, 2), np.float32)
     field[10:20, 30:50] = (4, -3)
     flow = Flow.of(field, spacing_px=5)
@@ -228,7 +227,7 @@ def test_vectors_are_on_a_grid_where_something_moves():
     np.testing.assert_allclose(flow.end_px - flow.start_px, np.tile([4, -3], (8, 1)))
     columns, rows = np.floor(flow.start_px).astype(int).T
     assert (field[rows, columns] == (4, -3)).all()
-    starts, ends = (np.stack(list(images.images)) for images in flow.discs((40, 60)))
+    starts, ends = (np.stack(list(images.images)) for images in flow.layers((40, 60)))
     for discs, points in ((starts, flow.start_px), (ends, flow.end_px)):
         centres = [np.argwhere(disc).mean(axis=0)[::-1] + 0.5 for disc in discs]
         np.testing.assert_allclose(centres, points, atol=0.3)
@@ -260,7 +259,7 @@ def test_no_vector_starts_where_flow_is_unknown(unknown):
     np.testing.assert_array_equal(flow.start_px, known.start_px[known.start_px[:, 1] > 20])
 
 
-def test_a_flo_file_is_read_as_middlebury_wrote_it(tmp_path):
+def test_a_flo_file_of_middlebury_is_read_exactly(tmp_path):
     field = np.random.default_rng(0).normal(0, 9, (5, 7, 2)).astype("<f4")
     field[0] = 1.7e9
     path = tmp_path / "a.flo"
@@ -273,7 +272,7 @@ def test_a_flo_file_is_read_as_middlebury_wrote_it(tmp_path):
         (whole + b"x", "in 293 bytes"),
         (struct.pack("<fii", 202021.25, -7, -5) + field.tobytes(), "found -7 x -5 pixels"),
         (struct.pack(">fii", 202021.25, 7, 5) + field.tobytes(), "starts with b'PIEH', found b'HEIP'"),
-        (b"\x89PNG\r\n", r"decode it yourself and say Flow.of"),
+        (b"\x89PNG\r\n", r"decode it and use Flow.of"),
         (b"PIEH\1", "found 1 x 0 pixels in 5 bytes"),
     ):
         path.write_bytes(content)
@@ -286,7 +285,7 @@ def test_a_flo_file_is_read_as_middlebury_wrote_it(tmp_path):
 # --- maps ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_map_knows_its_metres(tmp_path):
+def test_a_map_is_metric(tmp_path):
     values = np.zeros((3, 40, 40), np.float32)
     values[0, 8:12, 20:24] = 0.9  # 0 to 0.5 m right, 3.5 to 4 m forward
     values[1, 39, 0] = 0.2
@@ -297,7 +296,7 @@ def test_a_map_knows_its_metres(tmp_path):
     table = bev.footprints()
     assert table["area_m2"].tolist() == pytest.approx([15 * 0.125**2, 0, 0])
     assert bev.centres_m[0] == pytest.approx([0.25 + 0.1875 / 15, 3.75 - 0.1875 / 15])
-    assert bev.centres_m[1] == pytest.approx([-2.4375, 0.0625])  # seen although no map shows it
+    assert bev.centres_m[1] == pytest.approx([-2.4375, 0.0625])  # although its map is empty
     assert np.isnan(bev.centres_m[2]).all()
     bev.save(str(tmp_path / "map"))  # the suffix is added
     assert [path.name for path in tmp_path.iterdir()] == ["map.npz"]
@@ -315,15 +314,15 @@ def test_a_map_knows_its_metres(tmp_path):
     assert axes.lines[0].get_xydata()[0] == pytest.approx([-2.4375, 0.0625])
 
 
-# --- objects that move --------------------------------------------------------------------------------------------
+# --- moved objects ------------------------------------------------------------------------------------------------
 
 
-def test_a_moved_object_is_seen_elsewhere_by_all_sensors_and_nothing_else_changes():
+def test_a_moved_object_is_elsewhere_in_all_sensors_and_the_rest_is_unchanged():
     scene = build(furnished())
     chair = next(i.id for i in scene.instances if i.name == "chair")
     assert chair in movable(scene)
     after = moved(scene, chair, np.array([-0.25, -0.5, 0.0]))
-    pose = Pose(2.5, 0.1, 0.0, np.pi / 2)  # looks along +y, so that map and world axes agree
+    pose = Pose(2.5, 0.1, 0.0, np.pi / 2)  # forward is +y, so map and world axes agree
     before_map, after_map = (RayCaster(one).bev(pose, CAMERA).instance == chair for one in (scene, after))
     assert before_map.sum() == 16
     np.testing.assert_array_equal(after_map, np.roll(before_map, (4, -2), (0, 1)))  # 50 cm nearer, 25 cm to the left
@@ -337,7 +336,7 @@ def test_a_moved_object_is_seen_elsewhere_by_all_sensors_and_nothing_else_change
 
 def test_true_flow_by_hand():
     camera = CameraConfig(fpv_px=100, bev_px=40, hfov_deg=90)
-    points = np.array([[[1.0, 2.0, 0.88], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]])  # the last one is nothing
+    points = np.array([[[1.0, 2.0, 0.88], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]])  # the last one is a pixel without a point
     flow = true_flow(points, np.array([0.0, -1.0, 0.0]), camera)
     assert flow[0].tolist() == [[pytest.approx(25), 0], [0, pytest.approx(22)], [0, 0]]
 
@@ -351,7 +350,7 @@ def pair_of_a_moving_box(seed: int) -> tuple[MovingPair, tuple[int, int, int]]:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_true_flow_leads_to_the_object_in_the_second_photograph(seed):
+def test_true_flow_ends_on_the_object_in_the_second_photograph(seed):
     pair, color = pair_of_a_moving_box(seed)
     rows, columns = np.nonzero(pair.on_object)
     assert np.mean(np.abs(pair.first[rows, columns].astype(int) - color).max(axis=-1) < 12) > 0.95
@@ -366,10 +365,10 @@ def test_a_home_without_movable_objects_has_no_pair():
     assert moving_pair(build(room((5, 4, 2.5))), CAMERA, np.random.default_rng(0)) is None
 
 
-def test_arrows_are_as_wrong_as_the_depth_they_come_from():
+def test_errors_of_arrows_grow_with_errors_of_depth():
     pair, _ = pair_of_a_moving_box(0)
     depth = torch.from_numpy(np.where(pair.on_object, pair.point_m[..., 1], 0).astype(np.float32))
-    coarse = depth[2::4, 2::4][None, None]  # the first frame's, for both: the end falls off the object
+    coarse = depth[2::4, 2::4][None, None]  # of the first frame, for both frames: the end may miss the object
     errors = arrow_errors(Projector("a.1", CAMERA, None, lambda rgb: coarse), pair, pair.flow_px)
     assert errors["start"].median() < 0.15
     doubled = arrow_errors(Projector("a.1", CAMERA, None, lambda rgb: coarse * 1.5), pair, pair.flow_px)
@@ -377,7 +376,7 @@ def test_arrows_are_as_wrong_as_the_depth_they_come_from():
     assert arrow_errors(Projector("a.1", CAMERA, None, lambda rgb: coarse), pair, 0 * pair.flow_px) is None
 
 
-def test_the_table_of_motion_holds_means_over_pairs():
+def test_the_table_of_motion_has_means_over_pairs():
     lines = [(k, "true", "d", 10, 0.1, 0.1 * k, 0.2 * k, 0.3) for k in range(5)]
     names = ["pair", "flow", "row", "vectors", "missing", "start", "end", "motion"]
     line = motion_table(pd.DataFrame(lines, columns=names)).loc[("true", "d")]

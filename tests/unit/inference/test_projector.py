@@ -1,4 +1,4 @@
-"""`zerobev.load().project`: against the networks it wraps, against a closed form, and as a command."""
+"""`zerobev.load().project`: against the networks, against a closed form, and as a command."""
 
 import argparse
 import json
@@ -43,7 +43,7 @@ def models() -> dict[str, zerobev.Projector]:
 
 @pytest.fixture(scope="module")
 def rgb() -> np.ndarray:
-    """A floor, a wall, and a dark thing between them."""
+    """A floor, a wall, and a dark object between them."""
     image = np.full((SIDE, SIDE, 3), (200, 190, 170), np.uint8)
     image[SIDE // 2 + 8 :] = (120, 90, 60)
     image[SIDE // 2 - 4 : SIDE // 2 + 14, 20:40] = (40, 50, 60)
@@ -63,14 +63,14 @@ def flat(depth_m: float) -> zerobev.Projector:
     return zerobev.Projector("a.2", CAMERA, None, lambda rgb: torch.full((1, 1, SIDE, SIDE), depth_m))
 
 
-def test_the_package_is_light_until_it_is_used():
+def test_the_package_imports_torch_only_on_use():
     code = "import sys, zerobev; assert 'torch' not in sys.modules; assert zerobev.load and 'torch' in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
     with pytest.raises(AttributeError, match="no attribute 'unload'"):
         _ = zerobev.unload
 
 
-# --- the weights that ship ----------------------------------------------------------------------------------------
+# --- the shipped weights -----------------------------------------------------------------------------------------
 
 
 def test_the_weights_are_small_and_come_from_the_recorded_runs():
@@ -82,7 +82,7 @@ def test_the_weights_are_small_and_come_from_the_recorded_runs():
     assert json.loads((ROOT / "reports" / SCALE / "depth.json").read_text())["key"] == run_of(files[DEPTH])
 
 
-def test_half_precision_rounds_and_nothing_else():
+def test_half_precision_only_rounds():
     recorded = DepthNet.load(DepthPretraining(Workspace(SCALE)).weights).state_dict()
     for name, tensor in DepthNet.load(shipped(DEPTH)).state_dict().items():
         assert tensor.dtype == recorded[name].dtype
@@ -110,7 +110,7 @@ def test_weights_beyond_half_precision_are_refused(tmp_path):
     ("source", "message"),
     [("z", "source: expected one of a.2, c, .*found 'z'"), (shipped(DEPTH), "expected a zero-shot network")],
 )
-def test_what_is_no_zero_shot_network_is_not_loaded(source, message):
+def test_only_zero_shot_networks_are_loaded(source, message):
     with pytest.raises(InputError, match=message):
         zerobev.load(source)
 
@@ -128,7 +128,7 @@ def test_a_network_of_another_camera_needs_its_own_depth(tmp_path):
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_a_projector_is_its_network(row, models, rgb, masks):
+def test_a_projector_gives_the_output_of_its_network(row, models, rgb, masks):
     bev = models[row].project(rgb, masks, names=["floor", "thing", "nothing"])
     batch = torch.from_numpy(rgb / np.float32(255)).permute(2, 0, 1)[None]
     with torch.inference_mode():
@@ -136,20 +136,20 @@ def test_a_projector_is_its_network(row, models, rgb, masks):
         logits = load_model(shipped(row))(batch, torch.from_numpy(masks).float()[None], depth).zero_logits[0]
     np.testing.assert_allclose(bev.values[:2], logits[:2].sigmoid(), atol=1e-4)
     np.testing.assert_allclose(bev.evidence[:2], (logits[:2] - logits[2]).clamp(min=0), atol=1e-3)
-    assert not bev.values[2].any() and not bev.maps[2].any()  # empty, whatever the network makes of it
+    assert not bev.values[2].any() and not bev.maps[2].any()  # empty for every output of the network
     assert bev.labels == ("floor", "thing", "nothing") and bev.maps[0].any()
     assert not (bev.maps & ~bev.fov).any()
 
 
 @pytest.mark.parametrize("row", ["a.2", *ROWS])
-def test_size_and_type_of_the_photograph_do_not_matter(row, models, rgb, masks):
+def test_size_and_type_of_the_photograph_have_no_effect(row, models, rgb, masks):
     bev = models[row].project(rgb, masks)
     large = np.repeat(np.repeat(rgb, 5, 0), 5, 1).astype(np.float64) / 255
     again = models[row].project(large, np.repeat(np.repeat(masks, 5, 1), 5, 2))
     np.testing.assert_allclose(again.values, bev.values, atol=1e-3)
 
 
-def test_a_label_map_is_a_stack_of_masks(models, rgb, masks):
+def test_a_label_map_equals_a_stack_of_masks(models, rgb, masks):
     labels = np.where(masks[1], 4, np.where(masks[0], 1, -1)).astype(np.int16)
     bev = models[ROWS[0]].project(rgb, labels, names={1: "floor", 4: "thing"})
     stack = models[ROWS[0]].project(rgb, np.stack([labels == 1, labels == 4]))
@@ -165,7 +165,7 @@ def test_values_are_projected_level_by_level(rgb):
     np.testing.assert_allclose(bev.values, expected, atol=1e-6)
 
 
-def test_what_a_narrow_photograph_does_not_cover_is_outside_the_field_of_view(rgb):
+def test_parts_outside_a_narrow_photograph_are_outside_the_field_of_view(rgb):
     full, narrow = (flat(2.0).project(rgb, np.ones((SIDE, SIDE), bool), hfov_deg=hfov) for hfov in (79, 40))
     for bev, hfov in ((full, 79), (narrow, 40)):
         half_m = 2 * np.tan(np.radians(hfov / 2))
@@ -173,7 +173,7 @@ def test_what_a_narrow_photograph_does_not_cover_is_outside_the_field_of_view(rg
         assert (bev.fov.any(axis=0) == bev.maps[0].any(axis=0)).all()
 
 
-def test_boxes_come_back_with_label_and_score_where_they_are(rgb):
+def test_boxes_have_label_score_and_position(rgb):
     boxes = zerobev.Boxes(np.array([[30.0, 28, 34, 36], [44, 28, 48, 36]]), ("a", "b"), np.array([0.9, 0.4]))
     table = flat(3.0).project(rgb, boxes).footprints()
     assert table["label"].tolist() == ["a", "b"] and table["score"].tolist() == [0.9, 0.4]
@@ -181,7 +181,7 @@ def test_boxes_come_back_with_label_and_score_where_they_are(rgb):
     np.testing.assert_allclose(table["forward_m"], 3.0625)
 
 
-def test_an_arrow_leads_from_the_disc_at_its_start_to_that_at_its_end(rgb):
+def test_an_arrow_is_from_the_disc_at_its_start_to_the_disc_at_its_end(rgb):
     field = np.zeros((SIDE, SIDE, 2), np.float32)
     field[30:34, 10:13] = (30, 0)
     arrows = flat(2.0).project(rgb, zerobev.Flow.of(field))
@@ -195,7 +195,7 @@ def test_an_arrow_leads_from_the_disc_at_its_start_to_that_at_its_end(rgb):
 
 
 def test_the_kind_decides_the_result(models, rgb, masks, tmp_path):
-    """An own kind needs no more than the two methods; files serve as photographs."""
+    """A new kind needs only the two methods; photographs may be files."""
 
     class Column:
         def layers(self, shape):
@@ -215,12 +215,12 @@ def test_the_kind_decides_the_result(models, rgb, masks, tmp_path):
     bev = models["a.2"].project(rgb, zerobev.Masks(masks.astype(np.uint8) * 255), names=["x", "y", "z"])
     np.testing.assert_array_equal(bev.values, expected)
     assert bev.labels == ("x", "y", "z")
-    with pytest.raises(InputError, match="names: expected none beside Boxes, which has its own"):
+    with pytest.raises(InputError, match="names: expected none for Boxes, which contains its names"):
         models["a.2"].project(rgb, zerobev.Boxes([[1, 2, 30, 40]], ["a"], [1]), names=["b"])
 
 
 class Coarse:
-    """Estimates the brightness of what it sees, in metres, and keeps it."""
+    """An estimator of depth from brightness that records its inputs."""
 
     side_px = 256
 
@@ -233,7 +233,7 @@ class Coarse:
 
 
 @pytest.mark.parametrize(("side", "hfov", "seen"), [(1000, 79, 256), (150, 79, 150), (64, 79, 64), (40, 79, 64)])
-def test_an_estimator_sees_the_photograph_at_its_own_size_up_to_the_photograph_s(side, hfov, seen):
+def test_the_input_of_an_estimator_has_its_size_up_to_the_photograph_s(side, hfov, seen):
     estimator = Coarse()
     row, column = np.mgrid[:side, :side] / side
     photograph = np.stack([0.2 + 0.3 * row, 0.2 + 0.3 * column, 0.4 + 0 * row], axis=-1)
@@ -262,7 +262,7 @@ def test_a_network_on_another_device_is_refused():
         zerobev.Projector("a.2", CAMERA, None, torch.nn.Linear(1, 1, device="meta"))
 
 
-def test_depth_is_zero_where_the_photograph_covers_nothing(models, rgb):
+def test_depth_is_zero_outside_the_photograph(models, rgb):
     depth = models["a.2"].depth(rgb, hfov_deg=40)
     assert depth.shape == (SIDE, SIDE) and depth[SIDE // 2, SIDE // 2] > 0 and not depth[0].any()
 
@@ -278,7 +278,7 @@ def test_depth_is_zero_where_the_photograph_covers_nothing(models, rgb):
         (np.full((4, 4, 3), np.nan), r"rgb: expected values in \[0, 1\], found NaN"),
     ],
 )
-def test_what_is_no_photograph_is_refused(photograph, message):
+def test_invalid_photographs_are_refused(photograph, message):
     with pytest.raises(InputError, match=message):
         flat(1.0).project(photograph, np.ones((4, 4), bool))
 
@@ -329,7 +329,7 @@ def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, c
             assert file["labels"].tolist() == expected
 
 
-def test_the_command_says_what_is_wrong(rgb, tmp_path):
+def test_the_command_names_the_fault(rgb, tmp_path):
     photo, text, voc, small = (tmp_path / f"{name}.png" for name in ("photo", "text", "voc", "small"))
     Image.fromarray(np.array([[0, 7, 255]] * 3, np.uint8)).save(voc)
     Image.new("1", (4, 4)).save(small)

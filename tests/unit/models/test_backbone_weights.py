@@ -1,4 +1,4 @@
-"""Weights from elsewhere: the names of torchvision's networks, and refusal of whatever does not fit."""
+"""Pretrained weights: the names of torchvision's networks, and refusal of weights that do not fit."""
 
 import re
 from dataclasses import replace
@@ -26,7 +26,7 @@ def seeded():
 
 
 def encoder(model=SMALL) -> RgbEncoder:
-    """An encoder in evaluation mode, its batch norms unlike new ones."""
+    """An encoder in evaluation mode, with batch-norm statistics other than 0 and 1."""
     network = RgbEncoder(model).eval()
     for module in network.modules():
         if isinstance(module, torch.nn.BatchNorm2d):
@@ -36,13 +36,13 @@ def encoder(model=SMALL) -> RgbEncoder:
 
 
 def torchvision_weights(network: RgbEncoder) -> dict[str, torch.Tensor]:
-    """The weights under torchvision's names, with its classifier."""
+    """The weights with torchvision's names, and its classifier."""
     weights = {torchvision_name(name): tensor.clone() for name, tensor in network.network.state_dict().items()}
     return weights | {"fc.weight": torch.zeros(10, 4), "fc.bias": torch.zeros(10)}
 
 
 def torchvision_forward(weights: dict[str, torch.Tensor], rgb: torch.Tensor, bottleneck: bool) -> list[torch.Tensor]:
-    """Torchvision's ResNet, written down from its names: what each stage returns."""
+    """torchvision's ResNet from its weights' names: the output of each stage."""
 
     def conv(x: torch.Tensor, conv_name: str, norm_name: str, stride: int) -> torch.Tensor:
         kernel = weights[f"{conv_name}.weight"]
@@ -71,7 +71,7 @@ def torchvision_forward(weights: dict[str, torch.Tensor], rgb: torch.Tensor, bot
 
 
 @pytest.mark.parametrize("model", [SMALL, SMALL_BOTTLENECK], ids=["basic", "bottleneck"])
-def test_torchvision_weights_compute_what_torchvision_computes(model, tmp_path):
+def test_torchvision_weights_give_torchvision_s_output(model, tmp_path):
     weights = torchvision_weights(encoder(model))
     torch.save(weights, tmp_path / "resnet.pth")
     loaded = encoder(model)
@@ -100,7 +100,7 @@ def test_the_names_of_a_resnet_50():
 
 
 @pytest.mark.parametrize("form", ["torchvision", "checkpoint", "folder", "task folder"])
-def test_every_form_brings_all_weights(form, tmp_path):
+def test_every_source_replaces_all_weights(form, tmp_path):
     first, second = encoder(), RgbEncoder(SMALL)
     path = tmp_path / {"torchvision": "net.pth", "checkpoint": "net.safetensors"}.get(form, "net")
     if form == "torchvision":
@@ -143,7 +143,7 @@ def test_a_deeper_network_is_refused(tmp_path):
         load_backbone(encoder(), tmp_path / "deep.pth")
 
 
-def test_old_files_without_counters_are_welcome(tmp_path):
+def test_old_files_without_counters_are_accepted(tmp_path):
     weights = {k: v for k, v in torchvision_weights(encoder()).items() if "num_batches" not in k}
     torch.save(weights, tmp_path / "old.pth")
     target = encoder()
@@ -151,7 +151,7 @@ def test_old_files_without_counters_are_welcome(tmp_path):
     assert torch.equal(target.network.embedder.embedder.normalization.bias, weights["bn1.bias"])
 
 
-def test_a_folder_that_lacks_a_weight_is_refused(tmp_path):
+def test_a_folder_without_a_weight_is_refused(tmp_path):
     network = encoder().network
     lost = "encoder.stages.2.layers.0.shortcut.convolution.weight"
     network.save_pretrained(tmp_path, state_dict={k: v for k, v in network.state_dict().items() if k != lost})
@@ -160,14 +160,14 @@ def test_a_folder_that_lacks_a_weight_is_refused(tmp_path):
 
 
 class Code:
-    """What unpickling must not run."""
+    """Unpickling must not run this."""
 
     def __reduce__(self):
         return (pytest.fail, ("code in the file was run",))
 
 
 @pytest.mark.parametrize("content", ["nothing", "garbage", "code", "list", "nested"])
-def test_files_that_are_no_weights_are_refused(content, tmp_path):
+def test_files_without_weights_are_refused(content, tmp_path):
     path = tmp_path / "resnet.pth"
     if content == "garbage":
         path.write_bytes(b"weights")
@@ -180,6 +180,6 @@ def test_files_that_are_no_weights_are_refused(content, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["net.safetensors", "folder"])
-def test_a_source_that_is_not_there_is_named(name, tmp_path):
+def test_a_missing_source_is_named(name, tmp_path):
     with pytest.raises(InputError, match=re.escape(str(tmp_path / name))):
         load_backbone(encoder(), tmp_path / name)

@@ -1,4 +1,4 @@
-"""Depth in metres: pairs to learn from, errors in closed form, our network, and models of the transformers library."""
+"""Depth in metres: training pairs, errors in closed form, our network, and models of the transformers library."""
 
 import json
 import re
@@ -63,7 +63,7 @@ class Recorded:
 
 
 def recorded(*counts: int, side: int = 32) -> ViewSet:
-    """Photographs of random grey levels, brighter to the right, whose red channel tells the depth: red / 64 metres."""
+    """Images of random grey levels, brighter to the right; depth is red / 64 metres."""
     rng = np.random.default_rng(0)
     shards = []
     for count in counts:
@@ -74,7 +74,7 @@ def recorded(*counts: int, side: int = 32) -> ViewSet:
 
 
 class Red(nn.Module):
-    """Knows how `recorded` is made, and errs by a factor; what it is given is kept."""
+    """The estimator that inverts `recorded`, up to a factor; it records its inputs."""
 
     def __init__(self, factor: float = 1.0):
         super().__init__()
@@ -85,17 +85,17 @@ class Red(nn.Module):
         return self.noise(rgb[:, :1] * 255 / 64 * self.factor)
 
 
-# --- the stream ---------------------------------------------------------------------------------------------------
+# --- samples ------------------------------------------------------------------------------------------------------
 
 
-def test_photograph_and_depth_are_mirrored_together_half_of_the_time():
+def test_half_of_the_pairs_are_mirrored():
     batch = as_float(DepthSamples(recorded(30, 34), seed=0, batch=64).batch(0))
     torch.testing.assert_close(batch["depth"], batch["rgb"][:, :1] * 255 / 64)
     mirrored = batch["depth"][..., 0] > batch["depth"][..., -1]
     assert 20 < int(mirrored[:, 0, 0].sum()) < 44
 
 
-def test_every_pass_shows_every_view_once_in_another_order():
+def test_every_pass_has_every_view_once_in_another_order():
     views = recorded(5, 3)
     levels = sorted(float(views.locate(i)[1].depth.mean()) for i in range(8))
     passes = [DepthSamples(views, seed=1, batch=8).batch(step)["depth"].mean(dim=(1, 2, 3)) for step in (0, 1)]
@@ -104,7 +104,7 @@ def test_every_pass_shows_every_view_once_in_another_order():
         np.testing.assert_allclose(np.sort(shown), levels, rtol=1e-6)
 
 
-def test_processes_share_a_batch():
+def test_processes_divide_a_batch():
     data = DepthSamples(recorded(9), seed=3, batch=6)
     whole, parts = data.batch(2), [data.batch(2, rank, 2) for rank in (0, 1)]
     for name, tensor in whole.items():
@@ -114,7 +114,7 @@ def test_processes_share_a_batch():
 # --- objective, errors, prediction --------------------------------------------------------------------------------
 
 
-def test_the_objective_is_the_mean_absolute_difference_where_depth_is_known():
+def test_the_objective_is_the_mean_absolute_difference_over_known_depth():
     predicted = torch.tensor([1.0, 5.0, 9.0, 2.0], requires_grad=True)
     batch = {"rgb": torch.zeros(1), "depth": torch.tensor([2.0, 2.0, 0.0, 0.0])}
     losses = depth_objective(lambda rgb: predicted, batch)
@@ -145,19 +145,19 @@ def test_prediction_replaces_the_depth_of_every_view():
         np.testing.assert_allclose(predicted.locate(i)[1].depth, 2 * views.locate(i)[1].depth, rtol=1e-3)
 
 
-def test_training_learns_and_keeps_the_weights_that_validated_best(tmp_path):
+def test_training_learns_and_returns_the_best_validated_weights(tmp_path):
     config = TrainConfig(steps=40, learning_rate=1e-2, decay_every=10, decay=0.5, validate_every=20, warmup=5, batch=8)
     network = DepthNet(SMOKE.camera, SMOKE.model)
     validation = recorded(12)
     truth = np.concatenate([validation.locate(i)[1].depth for i in range(12)])
-    constant = np.abs(truth - np.median(truth)).mean()  # the best that knows nothing of the photograph
+    constant = np.abs(truth - np.median(truth)).mean()  # the best prediction without the image
     history = train_depth(network, recorded(24), validation, config, tmp_path, 0, key="toy", device="cpu")
     error = depth_errors(network, validation).mad_m
     assert error < 0.5 * constant
-    assert error == pytest.approx(history.best_score, rel=0.1)  # one in bfloat16, where the processor has it
+    assert error == pytest.approx(history.best_score, rel=0.1)  # the score may be in bfloat16
 
 
-def test_a_run_in_two_parts_ends_with_the_same_weights(tmp_path):
+def test_a_resumed_run_has_the_same_weights(tmp_path):
     def trained(folder: str, *steps: int) -> dict[str, torch.Tensor]:
         for until in steps:
             torch.manual_seed(1)
@@ -175,7 +175,7 @@ def test_a_run_in_two_parts_ends_with_the_same_weights(tmp_path):
 
 @pytest.mark.parametrize("side", [32, 45])
 @pytest.mark.parametrize("stem", [2, 4])
-def test_depth_has_the_size_of_the_photograph_and_each_pixel_sees_its_own(side, stem):
+def test_depth_has_the_size_of_the_image_and_each_pixel_its_own(side, stem):
     network = DepthNet(replace(SMOKE.camera, fpv_px=side), replace(SMOKE.model, stem_stride=stem)).eval()
     rgb = torch.rand(2, 3, side, side, requires_grad=True)
     depth = network(rgb)
@@ -187,7 +187,7 @@ def test_depth_has_the_size_of_the_photograph_and_each_pixel_sees_its_own(side, 
         assert gradient[1].abs().sum() == 0
 
 
-def test_the_network_knows_its_rays():
+def test_the_network_has_the_rays_as_input():
     wide, narrow = (DepthNet(replace(SMOKE.camera, hfov_deg=hfov), SMOKE.model).eval() for hfov in (79, 50))
     narrow.load_state_dict(wide.state_dict())
     rgb = torch.rand(1, 3, 32, 32)
@@ -196,14 +196,14 @@ def test_the_network_knows_its_rays():
     np.testing.assert_allclose(narrow.rays[0, 1, 0, 0], -np.tan(np.radians(25)) * 31 / 32, rtol=1e-5)
 
 
-def test_a_photograph_of_another_size_is_refused():
+def test_an_image_of_another_size_is_refused():
     with pytest.raises(InputError, match=r"rgb: expected \(1, 3, 32, 32\), found \(1, 3, 48, 48\)"):
         DepthNet(SMOKE.camera, SMOKE.model)(torch.rand(1, 3, 48, 48))
 
 
-def test_a_checkpoint_gives_the_network_back_and_pretrains_a_backbone(tmp_path):
+def test_a_checkpoint_restores_the_network_and_pretrains_a_backbone(tmp_path):
     network = DepthNet(SMOKE.camera, SMOKE.model)
-    network(torch.rand(4, 3, 32, 32))  # moves the statistics of the batch norms
+    network(torch.rand(4, 3, 32, 32))  # changes the statistics of the batch norms
     network.save(tmp_path / "depth.safetensors")
     again = DepthNet.load(tmp_path / "depth.safetensors")
     rgb = torch.rand(2, 3, 32, 32)
@@ -323,13 +323,13 @@ def prompt_depth_anything() -> PromptDepthAnythingForDepthEstimation:
 
 
 def loaded(network: PreTrainedModel, folder: Path) -> HubDepth:
-    """The network after a round trip through a folder; a DPT with the word that it predicts metres."""
+    """The network after a round trip through a folder; a DPT with `predicts_metres`."""
     network.save_pretrained(folder)
     return HubDepth.from_pretrained(folder, predicts_metres=network.config.model_type == "dpt")
 
 
 def seen_by(estimator: HubDepth) -> list[torch.Tensor]:
-    """What the network inside is given, call by call."""
+    """Inputs of the inner network, per call."""
     seen: list[torch.Tensor] = []
     estimator.network.register_forward_pre_hook(
         lambda module, args, kwargs: seen.append(kwargs["pixel_values"]), with_kwargs=True
@@ -350,7 +350,7 @@ def seen_by(estimator: HubDepth) -> list[torch.Tensor]:
         (zoedepth, 48, 64),
     ],
 )
-def test_a_folder_becomes_an_estimator_of_any_image_size(make, side, inner, tmp_path):
+def test_a_folder_gives_an_estimator_for_any_image_size(make, side, inner, tmp_path):
     network = make().eval()
     estimator = loaded(network, tmp_path)
     assert estimator.side_px == inner
@@ -368,14 +368,14 @@ def test_a_folder_becomes_an_estimator_of_any_image_size(make, side, inner, tmp_
 
 
 @pytest.mark.parametrize(("make", "farthest_m"), [(depth_anything, 20), (glpn, 10), (zoedepth, 10)])
-def test_metric_types_predict_metres_up_to_the_largest_of_their_configuration(make, farthest_m):
+def test_metric_types_predict_metres_up_to_the_maximum_of_their_configuration(make, farthest_m):
     estimator = HubDepth(make()).eval()
     with torch.no_grad():
         depth = estimator(torch.rand(1, 3, 64, 64))
     assert depth.min() > 0 and depth.max() <= farthest_m
 
 
-def test_a_projector_gives_such_a_model_the_photograph_at_its_own_size():
+def test_a_projector_resamples_the_photograph_to_the_size_of_the_model():
     estimator = HubDepth(depth_anything())
     seen = seen_by(estimator)
     fine = replace(SMOKE.camera, fpv_px=42)
@@ -387,7 +387,7 @@ def test_a_projector_gives_such_a_model_the_photograph_at_its_own_size():
 
 
 @pytest.mark.parametrize("own", [None, ((0.5, 0.4, 0.3), (0.25, 0.5, 1.0))])
-def test_photographs_are_normalised_as_the_image_processor_does(own, tmp_path):
+def test_images_are_normalised_as_in_the_image_processor(own, tmp_path):
     if own:
         settings = {"image_processor_type": "DPTImageProcessor", "image_mean": own[0], "image_std": own[1]}
         (tmp_path / "preprocessor_config.json").write_text(json.dumps(settings))
@@ -401,7 +401,7 @@ def test_photographs_are_normalised_as_the_image_processor_does(own, tmp_path):
 
 @pytest.mark.parametrize(("make", "mean", "std"), [(glpn, 0, 1), (zoedepth, 0.5, 0.5)])
 @pytest.mark.parametrize("settings", [None, {"do_normalize": False}])
-def test_without_settings_photographs_are_normalised_as_in_training(make, mean, std, settings, tmp_path):
+def test_without_settings_images_are_normalised_as_in_training(make, mean, std, settings, tmp_path):
     if settings:
         (tmp_path / "preprocessor_config.json").write_text(json.dumps(settings))
         mean, std = 0, 1
@@ -425,7 +425,7 @@ def test_relative_depth_is_refused(tmp_path):
     with pytest.raises(InputError, match=re.escape(message)):
         HubDepth.from_pretrained(tmp_path)
     dpt().save_pretrained(tmp_path)
-    with pytest.raises(InputError, match="found a DPT, relative as published: say predicts_metres=True"):
+    with pytest.raises(InputError, match="found a DPT, relative as published: pass predicts_metres=True"):
         HubDepth.from_pretrained(tmp_path)
 
 
@@ -446,7 +446,7 @@ def test_types_that_do_not_predict_metres_are_refused_before_their_weights_are_r
         HubDepth(network)
 
 
-def test_a_folder_that_lacks_a_weight_or_a_model_is_refused(tmp_path):
+def test_a_folder_without_a_weight_or_a_model_is_refused(tmp_path):
     with pytest.raises(InputError, match=re.escape(str(tmp_path / "nothing"))):
         HubDepth.from_pretrained(tmp_path / "nothing")
     network = dpt()

@@ -1,4 +1,4 @@
-"""The parts that networks are made of, and Zero-BEV: shapes, independence, sharing, attention, checkpoints."""
+"""Parts of networks, and Zero-BEV: shapes, independence, shared parts, attention, checkpoints."""
 
 import json
 from dataclasses import replace
@@ -27,7 +27,7 @@ def seeded():
 
 
 def network(camera=SMOKE.camera, **changes) -> ZeroBEV:
-    """A network of the smoke scale in evaluation mode, its batch norms with statistics unlike 0 and 1."""
+    """A network of the smoke scale in evaluation mode, with batch-norm statistics other than 0 and 1."""
     net = ZeroBEV(camera, replace(SMOKE.model, **changes)).eval()
     for module in net.modules():
         if isinstance(module, torch.nn.BatchNorm2d):
@@ -42,7 +42,7 @@ def images(batch: int, k: int, side: int = 32) -> tuple[torch.Tensor, torch.Tens
 
 @pytest.mark.parametrize("side", [32, 50, 61, 96])
 @pytest.mark.parametrize("stem", [2, 4])
-def test_both_extractors_meet_at_the_same_strides(side, stem):
+def test_both_extractors_have_the_same_strides(side, stem):
     model = replace(SMOKE.model, stem_stride=stem)
     rgb_maps = RgbEncoder(model).eval()(torch.rand(1, 3, side, side))
     zero_maps = ZeroCNN(model.zero_channels, stem)(torch.rand(1, 1, side, side))
@@ -58,7 +58,7 @@ def test_no_pixel_of_the_zero_image_is_lost(stem):
     assert (zero.grad != 0).all()
 
 
-def test_pyramid_keeps_odd_sizes_and_brings_the_coarse_pixel_over_its_fine_ones():
+def test_pyramid_keeps_odd_sizes_and_aligns_coarse_and_fine_pixels():
     pyramid = FeaturePyramid((3, 3, 3, 3), 5)
     sizes = (25, 13, 7, 4)
     maps = [torch.rand(2, 3, n, n) for n in sizes]
@@ -73,9 +73,9 @@ def test_pyramid_keeps_odd_sizes_and_brings_the_coarse_pixel_over_its_fine_ones(
 def test_columns_are_independent_and_attention_is_a_distribution():
     band = BandTransformer(16, 4, 32, 2, 0.0, rows=9, positions=5)
     columns = torch.randn(12, 9, 16)
-    rays, attention = band.attend(columns)
+    rays, attention = band(columns)
     order = torch.randperm(12)
-    assert torch.allclose(band(columns[order]), rays[order], atol=1e-5)
+    assert torch.allclose(band(columns[order])[0], rays[order], atol=1e-5)
     assert [w.shape for w in attention.cross] == [(12, 4, 5, 9)] * 2
     assert [w.shape for w in attention.rays] == [(1, 4, 5, 5), (12, 4, 5, 5)]
     for weights in (*attention.columns, *attention.rays, *attention.cross):
@@ -113,37 +113,37 @@ def test_band_transformer_equals_the_library_attention_with_positions_on_queries
         y = layer.norms[0](y + Placed(layer.self_attention, q, q)(y, y))
         y = layer.norms[1](y + Placed(layer.cross_attention, q, p)(y, x))
         y = layer.norms[2](y + layer.feed_forward(y))
-    assert torch.allclose(band(columns), y, atol=1e-5)
+    assert torch.allclose(band(columns)[0], y, atol=1e-5)
 
 
 def test_ray_positions_start_from_their_own_embedding():
     band = BandTransformer(16, 4, 32, 2, 0.0, rows=9, positions=5)
-    band(torch.randn(3, 9, 16)).square().sum().backward()
+    band(torch.randn(3, 9, 16))[0].square().sum().backward()
     assert (band.ray.grad.abs().sum(1) > 0).all()
     assert len(band.ray.grad.unique(dim=0)) == 5
 
 
 @pytest.mark.parametrize("size", [20, 25, 33, 100])
-def test_decoder_gives_every_size_back(size):
+def test_decoder_keeps_every_size(size):
     assert BevDecoder(16, (8, 8, 8), 3)(torch.rand(2, 16, size, size)).shape == (2, 3, size, size)
 
 
 def test_maps_of_one_image_stay_channels_last():
-    """Turned around they are copied in every convolution that follows."""
+    """In another layout they would be copied in every following convolution."""
     net = build("c", SMOKE.camera, SMOKE.model)
     maps = net.fpv_maps(net.backbone(torch.rand(2, 3, 32, 32)), torch.rand(2, 1, 32, 32))
     assert all(m.is_contiguous(memory_format=torch.channels_last) for m in (*maps, *net.pyramid(maps)))
 
 
-def test_map_features_are_zero_where_no_column_looks():
+def test_map_features_are_zero_outside_the_view():
     net = network()
     features, _ = net.bands(net.pyramid(net.fpv_maps(net.backbone(torch.rand(2, 3, 32, 32)), torch.rand(2, 1, 32, 32))))
     assert torch.equal((features != 0).any(1).all(0), net.bands.valid)
 
 
 @torch.no_grad()
-def test_a_column_of_the_image_reaches_only_its_rays():
-    """Through the far band alone: change one column of the finest map, and only the cells it sees change."""
+def test_a_column_of_the_image_affects_only_its_rays():
+    """In the far band, a change to one column of the finest map changes only cells within its view."""
     net = network()
     maps = net.pyramid(net.fpv_maps(net.backbone(torch.rand(1, 3, 32, 32)), torch.rand(1, 1, 32, 32)))
     before, _ = net.bands(maps)
@@ -209,8 +209,8 @@ def test_unusable_checkpoints_are_named(tmp_path, how):
     assert str(path) in str(caught.value) and "expected" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_ground_start_looks_at_the_floor_and_a_plain_start_does_not():
-    """Before any training, each position of a ray attends to the row that sees the floor at its depth."""
+def test_only_a_ground_start_attends_to_the_floor():
+    """Before training, each position of a ray attends to the image row of the floor at its depth."""
     camera = CameraConfig(fpv_px=64, bev_px=40)
     images = torch.rand(2, 3, 64, 64), (torch.rand(2, 1, 64, 64) > 0.8).float()
     errors = {}
@@ -225,8 +225,8 @@ def test_a_ground_start_looks_at_the_floor_and_a_plain_start_does_not():
     assert errors[True] < 0.6 and errors[False] > 3
 
 
-def test_residual_gain_scales_what_the_projection_adds():
-    """The map features move in proportion to the gain when the projection appears."""
+def test_residual_gain_scales_the_added_projection():
+    """The change of the map features by the projection is proportional to the gain."""
     zero, depth = torch.ones(1, 1, 32, 32), torch.full((1, 1, 32, 32), 2.0)
     moved = []
     for gain in (1.0, 6.0):
@@ -235,7 +235,7 @@ def test_residual_gain_scales_what_the_projection_adds():
         seen = []
         net.decoder.register_forward_pre_hook(lambda module, features, seen=seen: seen.append(features[0]))
         with torch.inference_mode():
-            for planes in (depth, torch.zeros_like(depth)):  # depth 0: no pixel reaches the map
+            for planes in (depth, torch.zeros_like(depth)):  # depth 0: no pixel has a cell
                 net(torch.zeros(1, 3, 32, 32), zero, planes)
         moved.append(seen[0] - seen[1])
     assert moved[0].abs().max() > 0.1

@@ -41,8 +41,8 @@ def resamplers(camera: CameraConfig, stem: int = 2) -> list[tuple[range, int, Po
 
 @given(cameras, st.sampled_from([2, 4]))
 @settings(max_examples=25, deadline=None)
-def test_a_ramp_over_the_image_columns_reads_back_the_pinhole_column(camera, stem):
-    """A ray map that holds its own image column must give every cell the column that the pinhole model says."""
+def test_a_ramp_over_the_image_columns_gives_the_pinhole_column(camera, stem):
+    """Rays with their image column as value give every cell its column in the pinhole model."""
     for rows, stride, resample in resamplers(camera, stem):
         count = -(-camera.fpv_px // stride)
         centres = stride * (torch.arange(count) + 0.5)
@@ -56,8 +56,8 @@ def test_a_ramp_over_the_image_columns_reads_back_the_pinhole_column(camera, ste
 
 
 @pytest.mark.parametrize(("scale", "stem"), [("smoke", 2), ("reduced", 2), ("paper", 4)])
-def test_one_hot_columns_light_the_cells_they_see(scale, stem):
-    """Light one column at one ray position: exactly the cells of that row within one column's width light up."""
+def test_one_hot_columns_are_resampled_to_their_cells(scale, stem):
+    """One column at one ray position: exactly the cells of that row within one column's width are above zero."""
     camera = SCALES[scale].camera
     for rows, stride, resample in resamplers(camera, stem):
         count = camera.fpv_px // stride
@@ -70,7 +70,7 @@ def test_one_hot_columns_light_the_cells_they_see(scale, stem):
             u = cell_in_image(camera, rows[p], column)
             distance = abs(u / stride - (lit + 0.5))
             if lit == 0 and u < stride / 2:
-                distance = 0.0  # left of the first centre its value goes on
+                distance = 0.0  # the first value extends to the left edge
             expected = max(0.0, 1 - distance) if 0 <= u <= camera.fpv_px else 0.0
             assert features[p, column].item() == pytest.approx(expected, abs=1e-5)
 
@@ -88,11 +88,11 @@ def test_bands_tile_the_map_and_the_view_is_symmetric(camera):
 
 
 @pytest.mark.parametrize("fpv", [96, 100])
-def test_points_of_the_ground_land_where_the_pinhole_model_says(fpv):
-    """Every cell reads its own place from the image, where the pinhole model puts that place of the floor.
+def test_points_of_the_floor_are_in_their_cells_of_the_pinhole_model(fpv):
+    """Every cell gets its own position from the image, in which the pinhole model projects the floor.
 
     The image holds x / z and 1 / z of the floor in each pixel. Both are linear in the pixel's position, so that
-    attention to the two image rows around the right one, and the resampler's interpolation, lose nothing.
+    attention to the two image rows around the right one, and the resampler's interpolation, are exact.
     """
     camera = CameraConfig(fpv_px=fpv, bev_px=40, height_m=0.3)
     focal = fpv / 2 / math.tan(math.radians(79) / 2)
@@ -102,7 +102,7 @@ def test_points_of_the_ground_land_where_the_pinhole_model_says(fpv):
         offset = (centre - fpv / 2) / focal
         floor = torch.stack([offset.expand(count, count), offset[:, None].expand(count, count) / 0.3])[None]
         z = 5 - (torch.tensor(rows) + 0.5) * 0.125
-        at = ((fpv / 2 + focal * 0.3 / z) / stride - 0.5)[:, None]  # image row of the ground at depth z, in map pixels
+        at = ((fpv / 2 + focal * 0.3 / z) / stride - 0.5)[:, None]  # image row of the floor at depth z, in map pixels
         attention = (1 - (at - torch.arange(count)).abs()).clamp(min=0)  # P R
         seen = at[:, 0] <= count - 1
         cells, valid = resample(reweigh(attention.expand(count, 2, -1, -1), floor))  # 1 P M 2
@@ -130,7 +130,7 @@ def test_true_correspondence_as_attention_gives_the_projection(band):
     depth = torch.from_numpy(RayCaster(build(furnished())).fpv(Pose(0.5, 2.6, 0.0, -0.1), coarse).distance)
     side = coarse.fpv_px
     zero = (torch.rand(1, 4, 5, 5, generator=torch.Generator().manual_seed(0)) > 0.5).float()
-    zero = F.interpolate(zero, (side, side), mode="nearest")  # four images, one a head
+    zero = F.interpolate(zero, (side, side), mode="nearest")  # four images, one per head
     cell = cells_of_pixels(depth, camera=coarse)  # R C
     member = (cell // 40)[None] == torch.tensor(rows)[:, None, None]  # P R C
     attention = (member / member.sum(1, keepdim=True).clamp(min=1)).permute(2, 0, 1)  # C P R
@@ -180,8 +180,8 @@ def test_sinusoids_have_sine_on_even_and_cosine_on_odd_channels():
 
 @given(cameras, st.sampled_from((2, 4, 8, 16)))
 @settings(max_examples=30)
-def test_floor_rows_see_the_floor(camera, stride):
-    """A point at the depth of a map row, on the image row that is named, has no height."""
+def test_floor_rows_are_rows_of_the_floor(camera, stride):
+    """A point at the depth of a map row, in its floor row, has height zero."""
     rows = range(camera.bev_px)
     found = floor_row(camera, rows, stride)
     last = -(-camera.fpv_px // stride) - 1
@@ -191,7 +191,7 @@ def test_floor_rows_see_the_floor(camera, stride):
         pixel = stride * (row + 0.5) - 0.5
         assert pixel > camera.fpv_px / 2 - 0.5
         if row < last:
-            slope = (height[-1] - height[0]) / (camera.fpv_px - 1)  # heights fall evenly from row to row
+            slope = (height[-1] - height[0]) / (camera.fpv_px - 1)  # heights are linear in the row
             assert abs(height[0] + slope * pixel) < 1e-4 * max(1.0, depth)
         else:
             assert row == last

@@ -1,4 +1,4 @@
-"""Every network of the paper's tables: size, contract, sharing, checkpoints, and that it can learn."""
+"""Every network of the paper's tables: size, interface, shared parts, checkpoints, learning."""
 
 import json
 from dataclasses import replace
@@ -37,7 +37,7 @@ def seeded():
 
 
 def network(row: str, camera: CameraConfig = SMOKE.camera, **changes) -> BevModel:
-    """A network of the smoke scale in evaluation mode, its batch norms with statistics unlike 0 and 1."""
+    """A network of the smoke scale in evaluation mode, with batch-norm statistics other than 0 and 1."""
     net = build(row, camera, replace(SMOKE.model, **changes)).eval()
     for module in net.modules():
         if isinstance(module, nn.BatchNorm2d):
@@ -52,8 +52,8 @@ def inputs(batch: int, k: int = CLASSES, side: int = 32) -> tuple[Tensor, Tensor
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_maps_start_from_their_prior_and_auxiliary_maps_from_one_half(row):
-    """A prior shifts the logits of what is projected, by as much as its own logit, and nothing else."""
+def test_initial_maps_have_the_foreground_prior_and_auxiliary_maps_one_half(row):
+    """The prior shifts the logits of the main maps by its logit, and changes no auxiliary map."""
     rgb, zero, depth = inputs(2)
     results = []
     for prior in (0.5, 0.1):
@@ -144,7 +144,7 @@ def test_one_sample_passes_forward_and_backward_at_paper_scale(row):
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_shapes_and_gradients_reach_every_parameter(row):
+def test_shapes_and_gradients_of_every_parameter(row):
     net = network(row).train()
     out = net(*inputs(2))
     assert out.zero_logits.shape == (2, 8, 20, 20)
@@ -183,8 +183,8 @@ def test_a_batch_of_one_can_be_trained_on(row):
 
 
 @torch.no_grad()
-def test_who_reads_what():
-    """VPN and TIM see the photograph alone, TIM with segmentation the masks too; depth is the residual variant's."""
+def test_inputs_used_by_each_network():
+    """VPN and TIM use only the RGB image, TIM with segmentation the masks too; only residual variants use depth."""
     rgb, zero, depth = inputs(2)
     for row, reads_zero, reads_depth in (
         *(("b.1", False, False), ("b.2", False, False), ("b.3", True, False)),
@@ -235,7 +235,7 @@ def test_wrong_configurations_are_named():
 @torch.no_grad()
 @pytest.mark.parametrize("row", ZERO_SHOT)
 @pytest.mark.parametrize("batch", [1, 3])
-def test_modalities_share_the_photograph_and_nothing_else(row, batch):
+def test_modalities_share_only_the_rgb_features(row, batch):
     net, (rgb, zero, depth), calls = network(row), inputs(batch), []
     hook = net.backbone.register_forward_hook(lambda *_: calls.append(1))
     together = net(rgb, zero, depth)
@@ -270,8 +270,8 @@ def test_the_residual_is_an_embedding_of_the_projection_added_to_the_map_feature
 
 
 @torch.no_grad()
-def test_identity_values_are_the_columns_weighted_by_attention():
-    """Two photographs with three images each, written out: position p of column c holds its head's weighted sum."""
+def test_reweigh_sums_columns_weighted_by_attention():
+    """Two RGB images with three zero-shot images each: position p of column c is the weighted sum of its head."""
     cross = torch.rand(2 * 5, 4, 6, 7).softmax(-1)
     values = torch.rand(2 * 3, 8, 7, 5)
     rays = reweigh(cross, values)
@@ -282,8 +282,8 @@ def test_identity_values_are_the_columns_weighted_by_attention():
 
 
 @torch.no_grad()
-def test_attention_comes_from_the_photograph_alone():
-    """Auxiliary maps do not see the zero-shot image, zero-shot maps are linear in its features up to the U-Net."""
+def test_attention_depends_only_on_the_rgb_image():
+    """Auxiliary maps do not depend on the zero-shot image; features of its map are linear in those of the zero CNN."""
     net, (rgb, zero, _), seen = network("e"), inputs(2, 1), []
     assert torch.equal(net(rgb, zero).aux_logits, net(rgb, 1 - zero).aux_logits)
     net.zero_cnn.register_forward_hook(lambda _m, _i, maps: [2 * features for features in maps])
@@ -314,8 +314,8 @@ def test_cross_attention_of_any_column_and_position(row):
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
-def test_noisy_or_max_pools_what_open_gates_show(seed):
-    """For gates that are open or closed and binary values: the maximum of the values behind open gates."""
+def test_noisy_or_max_pools_the_values_of_open_gates(seed):
+    """For binary gates and values: the maximum over the pixels with open gates."""
     rng = np.random.default_rng(seed)
     open_, values = rng.random((3, 5, 7)) < 0.3, rng.random((3, 7, 4)) < 0.5
     logits = torch.from_numpy(np.where(open_, 40.0, -40.0)).float()
@@ -326,7 +326,7 @@ def test_noisy_or_max_pools_what_open_gates_show(seed):
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
-def test_noisy_or_lies_between_the_largest_term_and_the_sum_and_is_monotone(seed):
+def test_noisy_or_is_between_the_largest_term_and_the_sum_and_is_monotone(seed):
     torch.manual_seed(seed)
     logits, values = 3 * torch.randn(2, 5, 7), torch.rand(2, 7, 4)
     terms = logits.sigmoid()[..., None] * values[:, None]  # 2 5 7 4
@@ -338,14 +338,14 @@ def test_noisy_or_lies_between_the_largest_term_and_the_sum_and_is_monotone(seed
     assert (noisy_or(logits, raised) >= found - 1e-6).all()
     order = torch.randperm(4)
     torch.testing.assert_close(noisy_or(logits, values[..., order]), found[..., order])
-    # the shortcut for binary values is the same function
+    # the faster form for binary values is the same function
     binary = (values > 0.5).float()
     torch.testing.assert_close(noisy_or(logits, binary), noisy_or(logits, binary * (1 - 1e-7)), atol=1e-4, rtol=1e-4)
 
 
 @torch.no_grad()
-def test_with_one_gate_a_pixel_the_pooled_map_is_the_projection():
-    """Gates that are open where each pixel's depth puts it: P^-1 on the rays, cell by cell where columns are exact."""
+def test_with_one_gate_per_pixel_the_pooled_map_is_the_projection():
+    """Gates are open at the depth of each pixel: P^-1 on the rays, per cell if columns are exact."""
     batch = views(4, SMOKE.camera)
     net, camera = network("f"), SMOKE.camera
     row = camera.bev_px - 1 - (batch["depth"][:, 0] / camera.cell_m).floor().long()  # B H W
@@ -372,7 +372,7 @@ def test_bytes_are_not_taken_for_values(row):
 
 @torch.no_grad()
 @pytest.mark.parametrize("row", ROWS)
-def test_a_checkpoint_needs_nothing_else(row, tmp_path):
+def test_a_checkpoint_is_self_contained(row, tmp_path):
     net, images = network(row), inputs(2)
     net.save(tmp_path / "a.safetensors")
     loaded = load_model(tmp_path / "a.safetensors")
@@ -401,8 +401,8 @@ def test_checkpoints_of_other_classes_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "c", "d", "e", "f"])
-def test_eight_views_are_learnt_by_heart(row):
-    """Far below the loss of ones everywhere, the best that knows nothing of the view."""
+def test_eight_views_are_learnt_exactly(row):
+    """Far below the loss of ones everywhere, the best prediction without the view."""
     batch = views(8, SMOKE.camera)
     if row[0] == "b":
         batch |= {"zero": batch["classes"], "target": batch["class_maps"]}

@@ -1,10 +1,11 @@
-"""A GPU computes what the CPU computes: training with workers and resumption, bfloat16, evaluation, projection.
+"""GPU results equal CPU results: training with workers and resumption, bfloat16, evaluation, projection.
 
-Every test runs on the CPU; the same tests on a GPU are skipped if there is none. Batches are drawn from a seed, so that
-neither homes nor a renderer are needed.
+Every test runs on the CPU; on a GPU it is skipped if there is none. Batches are drawn from a seed and need neither
+homes nor a renderer.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from zerobev.config import AUX, SCALES, TrainConfig
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.geometry.projection import inverse_project
 from zerobev.models import build
-from zerobev.training.loader import Batch
+from zerobev.training import train as training
+from zerobev.training.loader import Batch, batches
 from zerobev.training.train import train, training_accelerator
 
 CUDA = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU"))
@@ -24,13 +26,13 @@ CONFIG = TrainConfig(steps=12, learning_rate=2e-3, decay_every=6, validate_every
 
 
 class Blocks:
-    """Samples that can be learnt: blocks in the image, and on the map the same blocks, mirrored, all floor at 2 m."""
+    """Learnable samples: blocks in the image, and the same blocks mirrored on the map; depth is 2 m everywhere."""
 
     def __init__(self, seed: int, batch: int = CONFIG.batch, modalities: int = 1) -> None:
         self._seed, self._batch, self._modalities = seed, batch, modalities
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> Batch:
-        samples = [self.sample(self._batch * step + i) for i in range(rank, self._batch, ranks)]
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> Batch:
+        samples = [self.sample(self._batch * step + i) for i in range(rank, self._batch, world_size)]
         return {name: torch.from_numpy(np.stack([sample[name] for sample in samples])) for name in samples[0]}
 
     def sample(self, index: int) -> dict[str, np.ndarray]:
@@ -49,24 +51,29 @@ class Blocks:
 
 
 class Stopped(Exception):
-    """Raised in place of a kill."""
+    """Raised instead of a kill."""
 
 
 class Interrupted(Blocks):
-    """As `Blocks`, up to a step."""
+    """As `Blocks`, up to step 9."""
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> Batch:
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> Batch:
         if step == 9:
             raise Stopped
-        return super().batch(step, rank, ranks)
+        return super().batch(step, rank, world_size)
 
 
-def trained(folder, device, row="c", data=None, workers=0):
+@pytest.fixture(autouse=True)
+def no_workers(monkeypatch):
+    """Batches of `train` come from its own process, on a GPU, too."""
+    monkeypatch.setattr(training, "batches", partial(batches, workers=0))
+
+
+def trained(folder, device, data=None):
     torch.manual_seed(0)
-    model = build(row, SMOKE.camera, SMOKE.model)
+    model = build("c", SMOKE.camera, SMOKE.model)
     validation = [Blocks(1).batch(0)]
-    options = {"key": "cuda", "device": device, "workers": workers}
-    history = train(model, data or Blocks(0), validation, CONFIG, folder, 0, **options)
+    history = train(model, data or Blocks(0), validation, CONFIG, folder, 0, key="cuda", device=device)
     return model.cpu().state_dict(), history
 
 
@@ -77,10 +84,12 @@ def distance(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> fl
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_training_repeats_itself_with_workers_and_after_a_stop(device, tmp_path):
-    """The very bytes on the CPU; on a GPU sums in another order may differ in the last digits."""
+def test_training_is_the_same_with_workers_and_after_an_interruption(device, tmp_path, monkeypatch):
+    """Equal weights on the CPU; on a GPU the order of sums may change the last digits."""
     whole, history = trained(tmp_path / "whole", device)
-    with_workers, _ = trained(tmp_path / "workers", device, workers=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "batches", partial(batches, workers=2))
+        with_workers, _ = trained(tmp_path / "workers", device)
     with pytest.raises(Stopped):
         trained(tmp_path / "stopped", device, data=Interrupted(0))
     resumed, resumed_history = trained(tmp_path / "stopped", device)
@@ -93,19 +102,19 @@ def test_a_training_repeats_itself_with_workers_and_after_a_stop(device, tmp_pat
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("row", ["b.1", "c", "d", "e", "f.r"])
-def test_every_kind_of_network_learns_there(device, row, tmp_path):
+def test_every_kind_of_network_learns_on_the_device(device, row, tmp_path):
     classes = Blocks(0, modalities=8) if row == "b.1" else Blocks(0)
     torch.manual_seed(0)
     model = build(row, SMOKE.camera, SMOKE.model)
     config = replace(CONFIG, steps=30, validate_every=30)
-    history = train(model, classes, [classes.batch(0)], config, tmp_path, 0, key="cuda", device=device, workers=0)
+    history = train(model, classes, [classes.batch(0)], config, tmp_path, 0, key="cuda", device=device)
     losses = [entry.loss for entry in history.entries]
     assert np.mean(losses[-5:]) < np.mean(losses[:5])
     assert next(model.parameters()).device.type == device
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_forward_passes_are_bfloat16_where_the_device_computes_in_it(device):
+def test_forward_passes_are_bfloat16_if_the_device_computes_in_it(device):
     accelerator = training_accelerator(device)
     model = accelerator.prepare(build("c", SMOKE.camera, SMOKE.model))
     seen = []
@@ -116,14 +125,14 @@ def test_forward_passes_are_bfloat16_where_the_device_computes_in_it(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_evaluation_counts_what_the_cpu_counts(device):
+def test_evaluation_counts_equal_those_of_the_cpu(device):
     torch.manual_seed(0)
     model = build("d", SMOKE.camera, SMOKE.model)
     data = [Blocks(2, modalities=8).batch(step) for step in range(2)]
     batches = [{n: v.float() if v.dtype in (torch.bool, torch.uint8) else v for n, v in b.items()} for b in data]
     on_cpu = evaluate(model_predictor(model, "cpu"), batches, 2, 8)
     there = evaluate(model_predictor(model, device), batches, 2, 8)
-    # a logit of nearly zero may fall to the other side
+    # logits close to zero may change sign
     for name in ("intersection", "union"):
         assert np.abs(getattr(there, name) - getattr(on_cpu, name)).sum() <= 0.002 * on_cpu.union.sum()
 

@@ -1,4 +1,4 @@
-"""Batches drawn by worker processes: the same ones, in the same order, and nothing of a worker is left behind."""
+"""Batches drawn by worker processes: same batches, same order, and no process is left behind."""
 
 import multiprocessing
 import os
@@ -24,7 +24,7 @@ CAMERA, TEXTURE, CPU = CameraConfig(fpv_px=32, bev_px=20), TextureConfig(tiles=2
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory) -> ViewSet:
-    """Two shards of a scene, which this process has open."""
+    """Two shards of a scene, already opened by this process."""
     folder, scene = tmp_path_factory.mktemp("shards"), build(furnished())
     source = ViewSource(scene, CAMERA, TEXTURE, np.random.default_rng(0))
     for name in "ab":
@@ -49,14 +49,14 @@ def same(one: list, other: list) -> bool:
 
 @pytest.mark.parametrize("workers", [0, 1, 2])
 def test_workers_change_nothing(source, workers):
-    for place in ((0, 1), (1, 2)):
-        expected = [as_float(source.batch(step, *place)) for step in range(5, 12)]
+    for processes in ((0, 1), (1, 2)):
+        expected = [as_float(source.batch(step, *processes)) for step in range(5, 12)]
         torch.manual_seed(0)
-        assert same(list(batches(source, range(5, 12), CPU, place, workers)), expected)
+        assert same(list(batches(source, range(5, 12), CPU, *processes, workers)), expected)
         assert torch.initial_seed() == 0 and torch.rand(1) == torch.rand(1, generator=torch.manual_seed(0))
 
 
-def test_a_pass_over_the_test_views_is_shared_by_batches(views):
+def test_processes_divide_the_batches_of_a_pass_over_test_views(views):
     source = SemanticPass(views, CAMERA, 5)
     assert len(source) == 3
     halves = [list(batches(source, range(rank, len(source), 2), CPU, workers=1)) for rank in (0, 1)]
@@ -66,12 +66,12 @@ def test_a_pass_over_the_test_views_is_shared_by_batches(views):
 
 
 class Broken:
-    """A source whose step 2 fails: with an error of the data, or with the death of the process that draws it."""
+    """A source that fails at step 2: with an error of the data, or with the death of the process."""
 
     def __init__(self, dies: bool) -> None:
         self.dies = dies
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, torch.Tensor]:
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, torch.Tensor]:
         if step == 2 and self.dies:
             os.kill(os.getpid(), signal.SIGKILL)
         if step == 2:
@@ -80,7 +80,7 @@ class Broken:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_an_error_of_the_data_is_raised_as_it_is_and_in_its_turn(workers):
+def test_an_error_of_the_data_is_raised_unchanged_after_the_batches_before_it(workers):
     drawn = batches(Broken(dies=False), range(5), CPU, workers=workers)
     assert [next(drawn)["step"].item() for _ in range(2)] == [0, 1]
     with pytest.raises(InputError, match=r"^home\.h5: expected view 7, found nothing$"):
@@ -92,7 +92,7 @@ def test_a_worker_that_dies_is_an_error():
         list(batches(Broken(dies=True), range(5), CPU, workers=2))
 
 
-def test_workers_end_when_the_batches_are_left(source):
+def test_workers_end_when_the_iterator_is_closed(source):
     before = set(multiprocessing.active_children())
     drawn = batches(source, range(1000), CPU, workers=2)
     next(drawn)
@@ -101,11 +101,11 @@ def test_workers_end_when_the_batches_are_left(source):
     assert set(multiprocessing.active_children()) == before
 
 
-def test_the_cores_that_trainings_leave_are_shared(monkeypatch):
-    for cores, trainings, expected in ((64, None, 16), (16, None, 15), (64, 8, 7), (4, 8, 1), (1, None, 1)):
+def test_training_processes_divide_the_cores_for_workers(monkeypatch):
+    for cores, processes, expected in ((64, None, 16), (16, None, 15), (64, 8, 7), (4, 8, 1), (1, None, 1)):
         monkeypatch.setattr(joblib, "cpu_count", lambda cores=cores: cores)
-        if trainings is None:
+        if processes is None:
             monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
         else:
-            monkeypatch.setenv("LOCAL_WORLD_SIZE", str(trainings))
+            monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes))
         assert gpu_workers() == expected

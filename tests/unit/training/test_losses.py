@@ -1,6 +1,4 @@
-"""The Dice loss against sums done by hand, finite differences, and several processes against one."""
-
-from dataclasses import dataclass
+"""The Dice loss against sums by hand, finite differences, and several processes against one."""
 
 import numpy as np
 import pytest
@@ -11,17 +9,11 @@ from hypothesis.extra.numpy import arrays
 from torch import Tensor, distributed, multiprocessing
 
 from zerobev.common.errors import InputError
+from zerobev.models.base import MapLogits
 from zerobev.training.losses import dice_loss, zero_bev_loss
 
 UNIT = st.floats(0, 1, width=32)
 BINARY = st.integers(0, 1).map(float)
-
-
-@dataclass
-class Maps:
-    zero_logits: Tensor
-    aux_logits: Tensor | None
-    pooled: Tensor | None = None
 
 
 def test_dice_by_hand():
@@ -34,8 +26,8 @@ def test_dice_by_hand():
     assert dice_loss(probabilities, target, mask).item() == pytest.approx(1 - (first + second) / 2, abs=1e-6)
 
 
-def test_dice_ends():
-    """0 for the truth itself, 1 for its complement, and an absent class costs its full share."""
+def test_dice_limits():
+    """0 for the truth, 1 for its complement; an absent class has loss 1."""
     truth = torch.tensor([[1.0, 0.0], [1.0, 1.0]]).expand(1, 1, 2, 2)
     mask = torch.ones(1, 1, 2, 2)
     assert dice_loss(truth, truth, mask).item() == pytest.approx(0, abs=1e-6)
@@ -45,7 +37,7 @@ def test_dice_ends():
 
 
 def test_dice_sums_over_the_batch_not_over_images():
-    """An image without any true cell must not cost a full loss of its own."""
+    """An image without any true cell adds no loss."""
     target = torch.zeros(2, 1, 2, 2)
     target[0] = 1
     assert dice_loss(target, target, torch.ones(2, 1, 2, 2)).item() == pytest.approx(0, abs=1e-6)
@@ -67,11 +59,11 @@ def test_gradient_against_finite_differences():
     expected = (loss(0.01) - loss(-0.01)) / 0.02
     assert (gradient * direction).sum().item() == pytest.approx(expected, rel=1e-3)
     assert gradient[mask.expand_as(gradient) == 0].abs().max() == 0
-    assert (gradient * (1 - 2 * target)).min() >= 0, "more probability where the class is, less where it is not"
+    assert (gradient * (1 - 2 * target)).min() >= 0, "more probability inside the class, less outside"
 
 
 @given(arrays(np.float32, (2, 2, 3, 3), elements=UNIT), arrays(np.float32, (2, 2, 3, 3), elements=BINARY), st.data())
-def test_outside_the_fov_nothing_counts(probabilities, target, data):
+def test_cells_outside_the_fov_have_no_effect(probabilities, target, data):
     mask = data.draw(arrays(np.float32, (2, 1, 3, 3), elements=BINARY))
     other = data.draw(arrays(np.float32, (2, 2, 3, 3), elements=UNIT))
     first, truth, fov = (torch.from_numpy(array) for array in (probabilities, target, mask))
@@ -81,31 +73,31 @@ def test_outside_the_fov_nothing_counts(probabilities, target, data):
     assert dice_loss(first, truth, fov) == dice_loss(second, third, fov)
 
 
-def test_streams_are_weighed_by_alpha():
+def test_streams_are_weighted_by_alpha():
     generator = torch.Generator().manual_seed(1)
     zero, aux = torch.randn(2, 1, 4, 4, generator=generator), torch.randn(2, 2, 4, 4, generator=generator)
     batch = {"target": (zero > 0.3).float(), "aux": (aux > -0.3).float(), "fov": torch.ones(2, 1, 4, 4)}
     zero_dice = dice_loss(zero.sigmoid(), batch["target"], batch["fov"])
     aux_dice = dice_loss(aux.sigmoid(), batch["aux"], batch["fov"])
-    losses = zero_bev_loss(Maps(zero, aux), batch, alpha=0.25)
+    losses = zero_bev_loss(MapLogits(zero, aux), batch, alpha=0.25)
     torch.testing.assert_close(losses.total, 0.75 * zero_dice + 0.25 * aux_dice)
     assert (losses.main, losses.aux) == (zero_dice, aux_dice)
-    alone = zero_bev_loss(Maps(zero, None), batch, alpha=0.25)
+    alone = zero_bev_loss(MapLogits(zero, None), batch, alpha=0.25)
     assert alone.total == alone.main == zero_dice
     assert alone.aux is None
-    # maps before the U-Net join the total with the weight of the maps behind it, and not the score
+    # maps before the U-Net are added to the total, with the weight of the main maps, but not to the score
     pooled = torch.rand(2, 1, 4, 4, generator=generator)
-    shown = zero_bev_loss(Maps(zero, aux, pooled), batch, alpha=0.25)
+    shown = zero_bev_loss(MapLogits(zero, aux, pooled), batch, alpha=0.25)
     expected = losses.total + 0.75 * dice_loss(pooled, batch["target"], batch["fov"])
     torch.testing.assert_close(shown.total, expected)
     assert shown.main == zero_dice
 
 
-def test_a_model_of_one_auxiliary_map_is_held_against_its_own():
+def test_a_model_with_one_auxiliary_map_is_compared_with_that_map():
     aux = torch.randn(2, 1, 4, 4, generator=torch.Generator().manual_seed(1))
     truth = torch.cat([aux < 0, aux > 0], dim=1).float()
     batch = {"target": truth[:, :1], "aux": truth, "fov": torch.ones(2, 1, 4, 4)}
-    maps = Maps(aux, 99 * aux)
+    maps = MapLogits(aux, 99 * aux)
     assert zero_bev_loss(maps, batch, 0.5, aux=("navigable",)).aux < 0.1
     assert zero_bev_loss(maps, batch, 0.5, aux=("obstacles",)).aux > 0.9
     with pytest.raises(InputError, match=r"expected the target's shape \(2, 2, 4, 4\), found \(2, 1, 4, 4\)"):
@@ -116,14 +108,14 @@ def test_float32_under_autocast():
     """Sums of 10,000 cells do not fit bfloat16's eight bits."""
     logits = torch.linspace(-4, 4, 10_000).reshape(1, 1, 100, 100)
     batch = {"target": (logits > 1).float(), "fov": torch.ones(1, 1, 100, 100)}
-    plain = zero_bev_loss(Maps(logits, None), batch, 0.5).total
+    plain = zero_bev_loss(MapLogits(logits, None), batch, 0.5).total
     with torch.autocast("cpu", torch.bfloat16):
-        under = zero_bev_loss(Maps(logits, None), batch, 0.5).total
+        under = zero_bev_loss(MapLogits(logits, None), batch, 0.5).total
     assert under.dtype == torch.float32
     assert under == plain
 
 
-def _share(rank: int, logits: Tensor, batch: dict[str, Tensor], path: str) -> None:
+def _half(rank: int, logits: Tensor, batch: dict[str, Tensor], path: str) -> None:
     distributed.init_process_group("gloo", init_method=f"file://{path}/meet", rank=rank, world_size=2)
     mine = logits[rank::2].clone().requires_grad_()
     loss = dice_loss(mine.sigmoid(), batch["target"][rank::2], batch["fov"][rank::2])
@@ -133,11 +125,11 @@ def _share(rank: int, logits: Tensor, batch: dict[str, Tensor], path: str) -> No
 
 
 def test_two_processes_give_the_loss_of_one(tmp_path):
-    """Each process has half of the batch; the gradient's mean over processes is the whole batch's."""
+    """Each process has half of the batch; the mean gradient over processes is that of the whole batch."""
     generator = torch.Generator().manual_seed(2)
     logits = torch.randn(4, 2, 3, 3, generator=generator)
     batch = {"target": (torch.rand(4, 2, 3, 3, generator=generator) < 0.3).float(), "fov": torch.ones(4, 1, 3, 3)}
-    multiprocessing.spawn(_share, args=(logits, batch, str(tmp_path)), nprocs=2)
+    multiprocessing.spawn(_half, args=(logits, batch, str(tmp_path)), nprocs=2)
     logits.requires_grad_()
     loss = dice_loss(logits.sigmoid(), batch["target"], batch["fov"])
     (gradient,) = torch.autograd.grad(loss, logits)

@@ -1,28 +1,23 @@
 """The pictures of a training, read back as pixels."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from torch import Tensor, nn
 
+from zerobev.models.base import MapLogits
 from zerobev.training.monitor import curves_figure, maps_figure, write_picture
-
-
-class Maps(NamedTuple):
-    zero_logits: Tensor
 
 
 class Echo(nn.Module):
     """Predicts the zero-shot image."""
 
-    def forward(self, rgb: Tensor, zero: Tensor) -> Maps:
-        return Maps(20 * zero - 10)
+    def forward(self, rgb: Tensor, zero: Tensor) -> MapLogits:
+        return MapLogits(20 * zero - 10, None)
 
 
-def test_curves_leave_out_what_was_not_measured():
+def test_curves_leave_out_missing_values():
     steps = [10, 20, 30]
     curves = {"step": steps, "main": [0.9, 0.7, 0.6], "aux": [None] * 3, "validation": [None, 0.8, None]}
     (axes,) = curves_figure(curves).axes
@@ -30,7 +25,7 @@ def test_curves_leave_out_what_was_not_measured():
     assert drawn == {"main": (steps, [0.9, 0.7, 0.6]), "validation": ([20], [0.8])}
 
 
-def test_maps_are_those_of_the_batch_and_black_outside_the_field_of_view(tmp_path):
+def test_maps_match_the_batch_and_are_black_outside_the_field_of_view(tmp_path):
     zero = torch.zeros(6, 1, 4, 4)
     zero[:, :, 1] = 1
     fov = torch.ones(6, 1, 4, 4)

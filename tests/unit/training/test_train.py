@@ -1,4 +1,4 @@
-"""The training loop on a stand-in network: schedule, learning, reproducibility, and being killed in the middle."""
+"""The training loop on a small stand-in network: schedule, learning, reproducibility, interruption."""
 
 import json
 import logging
@@ -6,8 +6,8 @@ import multiprocessing
 import os
 import signal
 import time
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from zerobev.common.errors import InputError
 from zerobev.config import TrainConfig
+from zerobev.models.base import MapLogits
 from zerobev.training import train as training
 from zerobev.training.history import History
 from zerobev.training.losses import Losses, dice_loss
@@ -26,14 +27,8 @@ from zerobev.training.train import dice_objective, train
 CONFIG = TrainConfig(steps=20, learning_rate=0.01, decay_every=8, validate_every=6, warmup=3, patience=1, batch=4)
 
 
-class Maps(NamedTuple):
-    zero_logits: Tensor
-    aux_logits: Tensor | None
-    pooled: Tensor | None = None
-
-
 class StandIn(nn.Module):
-    """The contract of the real model at toy size, with dropout and running statistics."""
+    """A network of toy size with the interface of the real ones, dropout and running statistics."""
 
     def __init__(self, dropout: float = 0.2, seed: int = 0):
         super().__init__()
@@ -43,9 +38,9 @@ class StandIn(nn.Module):
             self.dropout = nn.Dropout(dropout)
             self.last = nn.Conv2d(8, 3, 3, padding=1)
 
-    def forward(self, rgb: Tensor, zero: Tensor) -> Maps:
+    def forward(self, rgb: Tensor, zero: Tensor) -> MapLogits:
         maps = self.last(self.dropout(self.first(torch.cat((rgb, zero), dim=1))))
-        return Maps(maps[:, :1], maps[:, 1:])
+        return MapLogits(maps[:, :1], maps[:, 1:])
 
 
 def samples(indices: range, size: int = 8) -> dict[str, Tensor]:
@@ -65,21 +60,21 @@ def samples(indices: range, size: int = 8) -> dict[str, Tensor]:
 class Samples:
     """Fresh samples for every step."""
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
-        return samples(range(step * CONFIG.batch + rank, (step + 1) * CONFIG.batch, ranks))
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
+        return samples(range(step * CONFIG.batch + rank, (step + 1) * CONFIG.batch, world_size))
 
 
 class Stuck(Samples):
-    """Samples that never come from a given step on; a file tells that it has been reached."""
+    """Samples that block at a given step; the file `marker` shows that it is reached."""
 
     def __init__(self, step: int, marker: Path):
         self.step, self.marker = step, marker
 
-    def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
+    def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
         if step == self.step:
             self.marker.touch()
             time.sleep(60)
-        return super().batch(step, rank, ranks)
+        return super().batch(step, rank, world_size)
 
 
 VALIDATION = [samples(range(10_000, 10_004)), samples(range(10_004, 10_008))]
@@ -91,7 +86,7 @@ def run(folder: Path, data=None, seed: int = 0, key: str = "run", **arguments) -
 
 
 def run_stuck(folder: Path, step: int) -> None:
-    """Body of a process that stands still at `step`."""
+    """Body of a process that blocks at `step`."""
     training.HISTORY_ENTRIES = 7
     run(folder, Stuck(step, folder / "marker"))
 
@@ -109,7 +104,7 @@ def unbroken(tmp_path_factory):
 
 
 def rates(config: TrainConfig, scores: dict[int, float]) -> list[float]:
-    """The learning rate of every step, with validations after the steps that `scores` names."""
+    """The learning rate of every step, with validations after the steps in `scores`."""
     optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))], lr=config.learning_rate)
     schedule = Schedule(optimizer, config)
     found = []
@@ -136,8 +131,8 @@ def test_schedule_without_plateau_or_warmup():
     assert rates(config, improving) == pytest.approx([2, 2, 1, 1, 0.5])
 
 
-def test_history_holds_the_schedule_and_the_validations(unbroken):
-    """The rate of the loop is the one of the schedule alone; the best validation is kept."""
+def test_history_contains_the_schedule_and_the_validations(unbroken):
+    """The loop has the learning rates of the schedule; the best validation is chosen."""
     folder, history = unbroken
     validated = [entry for entry in history.entries if entry.validation is not None]
     assert [entry.step for entry in validated] == [6, 12, 18, 20]
@@ -154,7 +149,7 @@ def test_history_holds_the_schedule_and_the_validations(unbroken):
 
 
 def test_score_is_the_dice_loss_of_the_best_weights(unbroken):
-    """The file holds the weights that the score belongs to."""
+    """The file contains the weights of the best score."""
     folder, history = unbroken
     model = StandIn()
     load_model(model, folder / "best.safetensors")
@@ -171,8 +166,8 @@ def bf16() -> bool:
     return any(torch.cpu.get_capabilities().get(name, False) for name in ("avx512_bf16", "amx_bf16"))
 
 
-def test_best_weights_are_kept_when_it_gets_worse(tmp_path):
-    """An objective that validates best early on: the weights returned are those of that step."""
+def test_best_weights_are_returned_when_scores_get_worse(tmp_path):
+    """The objective has its best validation early: the weights are those of that step."""
     scores = iter([0.3, 0.3, 0.1, 0.1, 0.2, 0.2, 0.5, 0.5])
     weights = {}
     model = StandIn()
@@ -192,11 +187,11 @@ def test_best_weights_are_kept_when_it_gets_worse(tmp_path):
 
 
 def test_learns(tmp_path):
-    """Eight samples are learned by heart, and the caller's model works as before."""
+    """Eight samples are learned exactly, and the caller's model works as before."""
     eight = samples(range(8))
 
     class Same:
-        def batch(self, step: int, rank: int, ranks: int) -> dict[str, Tensor]:
+        def batch(self, step: int, rank: int, world_size: int) -> dict[str, Tensor]:
             return eight
 
     config = TrainConfig(steps=150, learning_rate=0.03, decay_every=50, validate_every=50)
@@ -204,13 +199,13 @@ def test_learns(tmp_path):
     history = train(model, Same(), [eight], config, tmp_path, 0, key="k", device="cpu")
     assert history.best_score < 0.05
     assert history.entries[0].main > 0.3
-    assert "forward" not in vars(model), "nothing is left wrapped"
+    assert "forward" not in vars(model), "the model is not wrapped any more"
     predicted = model(eight["rgb"], eight["zero"]).zero_logits.sigmoid()
     assert dice_loss(predicted, eight["target"], eight["fov"]) < 0.05
 
 
 def test_pictures_are_drawn_at_every_validation(tmp_path):
-    """Curves always; a sample where the caller draws one, of the first validation batch."""
+    """Curves always; a sample of the first validation batch if the caller draws one."""
     seen = []
 
     def picture(model: nn.Module, batch: dict[str, Tensor]) -> Figure:
@@ -223,7 +218,7 @@ def test_pictures_are_drawn_at_every_validation(tmp_path):
 
 
 def test_same_seed_same_bytes(unbroken, tmp_path):
-    """Another seed differs (dropout); the caller's generator is untouched."""
+    """Another seed differs (dropout); the caller's generator is unchanged."""
     folder, _ = unbroken
     before = torch.get_rng_state()
     run(tmp_path / "again")
@@ -234,26 +229,27 @@ def test_same_seed_same_bytes(unbroken, tmp_path):
     assert files[0] != files[2]
 
 
-def test_workers_that_draw_the_batches_change_no_weight(unbroken, tmp_path):
-    run(tmp_path, workers=2)
+def test_workers_that_draw_the_batches_change_no_weight(unbroken, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "batches", partial(training.batches, workers=2))
+    run(tmp_path)
     assert (tmp_path / "best.safetensors").read_bytes() == (unbroken[0] / "best.safetensors").read_bytes()
 
 
 def resume(folder: Path, unbroken: tuple[Path, training.History]) -> list[int]:
-    """Go on in `folder`, hold the end against the unbroken run, and return the steps that were trained."""
+    """Resume in `folder`, compare the result with the unbroken run, and return the trained steps."""
     asked = []
 
     class Recorded(Samples):
-        def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
+        def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
             asked.append(step)
-            return super().batch(step, rank, ranks)
+            return super().batch(step, rank, world_size)
 
     history = run(folder, Recorded())
     whole, expected = unbroken
     assert (folder / "best.safetensors").read_bytes() == (whole / "best.safetensors").read_bytes()
     assert without_seconds(history.entries) == without_seconds(expected.entries)
     seconds = [entry.seconds for entry in history.entries]
-    assert seconds == sorted(seconds), "the clock goes on where it stopped"
+    assert seconds == sorted(seconds), "the clock resumes at its last value"
     assert len((folder / "history.jsonl").read_text().splitlines()) == len(expected.entries)
     ours, theirs = (torch.load(path / "checkpoint.pt", weights_only=True) for path in (folder, whole))
     for name, value in theirs["model"].items():
@@ -265,7 +261,7 @@ def resume(folder: Path, unbroken: tuple[Path, training.History]) -> list[int]:
 
 
 def test_killed_and_resumed(unbroken, tmp_path, monkeypatch):
-    """SIGKILL during the 17th step: taken up from the validation after the 12th, to the very same end."""
+    """SIGKILL during the 17th step: resumed after the validation of the 12th, with the same result."""
     process = multiprocessing.get_context("spawn").Process(target=run_stuck, args=(tmp_path, 16))
     process.start()
     deadline = time.monotonic() + 60
@@ -281,13 +277,13 @@ def test_killed_and_resumed(unbroken, tmp_path, monkeypatch):
 
 
 def test_resumed_between_validations(unbroken, tmp_path, monkeypatch):
-    """A checkpoint in the middle of a mean over three steps, after an error in the data."""
+    """A checkpoint between history entries, after an error in the data."""
 
     class Broken(Samples):
-        def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
+        def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
             if step == 17:
                 raise OSError("the disk went away")
-            return super().batch(step, rank, ranks)
+            return super().batch(step, rank, world_size)
 
     monkeypatch.setattr(training, "HISTORY_ENTRIES", 7)
     monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0)
@@ -299,10 +295,10 @@ def test_resumed_between_validations(unbroken, tmp_path, monkeypatch):
 
 
 def test_finished_run_is_not_repeated(unbroken, tmp_path):
-    """The same call again trains nothing and returns the same."""
+    """The same call again trains no step and returns the same."""
 
     class Nothing:
-        def batch(self, step: int, rank: int, ranks: int) -> dict[str, Tensor]:
+        def batch(self, step: int, rank: int, world_size: int) -> dict[str, Tensor]:
             raise AssertionError("no step is left")
 
     first = run(tmp_path)
@@ -325,7 +321,7 @@ def test_checkpoint_of_another_run(tmp_path):
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "text"])
 def test_damaged_checkpoint(unbroken, tmp_path, caplog, damage):
-    """Reported in the log, and the run starts over with the same end."""
+    """Reported in the log; the run starts again, with the same result."""
     folder, _ = unbroken
     whole = (folder / "checkpoint.pt").read_bytes()
     middle = len(whole) // 2
@@ -349,8 +345,8 @@ def test_damaged_checkpoint(unbroken, tmp_path, caplog, damage):
 
 def test_divergence_is_an_error(tmp_path):
     class Broken(Samples):
-        def batch(self, step: int, rank: int = 0, ranks: int = 1) -> dict[str, Tensor]:
-            batch = super().batch(step, rank, ranks)
+        def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
+            batch = super().batch(step, rank, world_size)
             return {**batch, "rgb": batch["rgb"] * (float("nan") if step == 2 else 1)}
 
     with pytest.raises(FloatingPointError, match="step 3"):
