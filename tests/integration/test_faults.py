@@ -17,7 +17,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from zerobev.common.errors import InputError, run_command
+from zerobev import cli
+from zerobev.common.errors import InputError
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, AgentConfig, CameraConfig, TextureConfig, TrainConfig
 from zerobev.data import generate as generation
@@ -325,13 +326,12 @@ def test_any_failure_of_a_home_is_its_own(
     monkeypatch.setattr(generation, "read_scene", read)
     monkeypatch.setattr(real_homes, "read_scene", read)
     commands = {
-        generation.main: ["--scale", "smoke", "--views", "1", "--out", str(tmp_path / "out")],
-        real_homes.main: ["--views", "1", "--json", str(tmp_path / "found.json")],
+        "generate": ["--scale", "smoke", "--views", "1", "--out", str(tmp_path / "out")],
+        "evaluate": ["--views", "1", "--json", str(tmp_path / "found.json")],
     }
-    for main, options in commands.items():
-        monkeypatch.setattr(sys, "argv", ["command", "--scenes", str(tmp_path / "homes"), *options])
+    for command, options in commands.items():
         with pytest.raises(SystemExit) as ended:
-            run_command(main)
+            cli.main([command, "--scenes", str(tmp_path / "homes"), *options])
         assert ended.value.code == f"skipped {cause}"
     assert {path.name for path in tmp_path.glob("out/*/*.h5")} == {f"{n}-Good.h5" for n in ("00001", "00800", "00901")}
     assert json.loads((tmp_path / "found.json").read_text())["scenes"] == ["00001-Good", "00800-Good", "00901-Good"]

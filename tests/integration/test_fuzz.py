@@ -374,7 +374,7 @@ def test_records(tmp_path: Path) -> None:
     assert min(seen["read"], seen["refused"]) > 100
     path.unlink()
     path.mkdir()
-    with pytest.raises(InputError, match=r"c-0\.json: expected a record of a run, found .*directory"):
+    with pytest.raises(InputError, match=r"c-0\.json: expected a record, found .*directory"):
         store.find("c-0")
 
 
