@@ -81,6 +81,7 @@ def test_saved_bytes_by_hand():
     assert saved_bytes(lambda: net(images).sum(), net) == 4 * (5 * 4 + 5 * 8)
 
 
+@pytest.mark.slow
 def test_a_forecast_measures_views_and_counts_existing_ones(tmp_path, monkeypatch):
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(forecasting, "_SECONDS", 0.1)

@@ -63,6 +63,7 @@ def flat(depth_m: float) -> zerobev.Projector:
     return zerobev.Projector("a.2", CAMERA, None, lambda rgb: torch.full((1, 1, SIDE, SIDE), depth_m))
 
 
+@pytest.mark.slow
 def test_the_package_imports_torch_only_on_use():
     code = "import sys, zerobev; assert 'torch' not in sys.modules; assert zerobev.load and 'torch' in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

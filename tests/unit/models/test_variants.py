@@ -400,6 +400,7 @@ def test_checkpoints_of_other_classes_are_named(tmp_path):
 # --- learning
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ["b.1", "b.2", "b.3", "c", "d", "e", "f"])
 def test_eight_views_are_learnt_exactly(row):
     """Far below the loss of ones everywhere, the best prediction without the view."""

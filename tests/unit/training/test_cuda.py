@@ -22,6 +22,7 @@ from zerobev.training.train import train, training_accelerator
 CUDA = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU"))
 DEVICES = ["cpu", CUDA]
 SMOKE = SCALES["smoke"]
+pytestmark = pytest.mark.slow
 CONFIG = TrainConfig(steps=12, learning_rate=2e-3, decay_every=6, validate_every=6, batch=8)
 
 

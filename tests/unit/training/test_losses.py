@@ -124,6 +124,7 @@ def _half(rank: int, logits: Tensor, batch: dict[str, Tensor], path: str) -> Non
     distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_loss_of_one(tmp_path):
     """Each process has half of the batch; the mean gradient over processes is that of the whole batch."""
     generator = torch.Generator().manual_seed(2)

@@ -260,6 +260,7 @@ def resume(folder: Path, unbroken: tuple[Path, training.History]) -> list[int]:
     return asked
 
 
+@pytest.mark.slow
 def test_killed_and_resumed(unbroken, tmp_path, monkeypatch):
     """SIGKILL during the 17th step: resumed after the validation of the 12th, with the same result."""
     process = multiprocessing.get_context("spawn").Process(target=run_stuck, args=(tmp_path, 16))
