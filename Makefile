@@ -24,7 +24,7 @@ export TOKENIZERS_PARALLELISM ?= false
 # Packages come only from .venv.
 unexport PYTHONHOME PYTHONPATH
 
-.PHONY: help setup reproduce check test unit fast integration static integrity nbval coverage lab notebooks clean distclean
+.PHONY: help setup reproduce check test unit unit-1 unit-2 fast-1 fast-2 integration static integrity nbval coverage lab notebooks clean distclean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
@@ -49,16 +49,23 @@ reproduce: setup ## run the workbook [SCALE=smoke|reduced|paper SCENES=dir TEXTU
 PARTS := $(MAKE) --jobs=2 --keep-going --output-sync=target
 
 test: setup ## run all tests, and check every notebook against its committed outputs
-	@$(PARTS) unit integration nbval integrity
+	@$(PARTS) unit-2 integration nbval unit-1 integrity
 
 check: setup ## the fast loop, under 3 min: style, types, layers, and the unit tests that are not slow
-	@$(PARTS) fast static
+	@$(PARTS) fast-2 fast-1 static
+
+# The unit tests in two halves, which run at once.
+FIRST_HALF := $(addprefix tests/unit/,scenes rendering data experiments theory)
+SECOND_HALF := tests/unit $(FIRST_HALF:%=--ignore=%)
 
 unit: setup ## the unit tests alone
 	@$(PYTHON) -m pytest tests/unit
 
-fast: setup ## the unit tests that are not slow
-	@$(PYTHON) -m pytest tests/unit -m "not slow"
+unit-1 unit-2: setup
+	@$(PYTHON) -m pytest $(if $(filter unit-1,$@),$(FIRST_HALF),$(SECOND_HALF))
+
+fast-1 fast-2: setup
+	@$(PYTHON) -m pytest $(if $(filter fast-1,$@),$(FIRST_HALF),$(SECOND_HALF)) -m "not slow"
 
 integration: setup ## the tests of several rooms or processes
 	@$(PYTHON) -m pytest tests/integration
