@@ -51,7 +51,7 @@ PARTS := $(MAKE) --jobs=2 --keep-going --output-sync=target
 test: setup ## run all tests, and check every notebook against its committed outputs
 	@$(PARTS) unit-2 integration nbval unit-1 integrity
 
-check: setup ## the fast loop, under 3 min: style, types, layers, and the unit tests that are not slow
+check: setup ## the fast loop, about 3 min: style, types, layers, and the unit tests that are not slow
 	@$(PARTS) fast-2 fast-1 static
 
 # The unit tests in two halves, which run at once.
