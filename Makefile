@@ -24,7 +24,7 @@ export TOKENIZERS_PARALLELISM ?= false
 # Packages come only from .venv.
 unexport PYTHONHOME PYTHONPATH
 
-.PHONY: help setup reproduce check test unit unit-1 unit-2 fast-1 fast-2 integration static integrity nbval coverage lab notebooks clean distclean
+.PHONY: help setup reproduce check test unit integration static integrity nbval coverage lab notebooks clean distclean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
@@ -54,7 +54,9 @@ test: setup ## run all tests, and check every notebook against its committed out
 check: setup ## the fast loop, about 3 min: style, types, layers, and the unit tests that are not slow
 	@$(PARTS) fast-2 fast-1 static
 
-# The unit tests in two halves, which run at once.
+# The unit tests in two halves, which run at once; not for the list of `make help`.
+.PHONY: unit-1 unit-2 fast-1 fast-2
+
 FIRST_HALF := $(addprefix tests/unit/,scenes rendering data experiments theory)
 SECOND_HALF := tests/unit $(FIRST_HALF:%=--ignore=%)
 
