@@ -91,16 +91,14 @@ def training_step(net: BevModel, batch: dict[str, Tensor], machine: Machine) -> 
 def blocks(net: ZeroBEV, batch: dict[str, Tensor], machine: Machine) -> dict[str, Run]:
     """Forward and backward pass of each block of the network alone, on its inputs in a step."""
     with machine.autocast():
-        rgb = net.backbone(batch["rgb"])
-        fpv = net.fpv_maps(rgb, batch["zero"])
-        pyramid = net.pyramid(fpv)
-        bev, _ = net.bands(pyramid)
-    inputs = {name: _leaves(maps) for name, maps in {"rgb": rgb, "fpv": fpv, "pyramid": pyramid, "bev": [bev]}.items()}
+        laterals = net.rgb_laterals(batch["rgb"])
+        fpv = net.fpv_maps(laterals, batch["zero"])
+        bev, _ = net.bands(fpv)
+    inputs = {name: _leaves(maps) for name, maps in {"laterals": laterals, "fpv": fpv, "bev": [bev]}.items()}
     parts: dict[str, Callable[[], Iterable[Tensor]]] = {
-        "backbone": lambda: net.backbone(batch["rgb"]),
-        "zero-shot CNN": lambda: net.fpv_maps(inputs["rgb"], batch["zero"]),
-        "pyramid": lambda: net.pyramid(inputs["fpv"]),
-        "band transformers": lambda: [net.bands(inputs["pyramid"])[0]],
+        "backbone": lambda: net.rgb_laterals(batch["rgb"]),
+        "zero-shot CNN and pyramid": lambda: net.fpv_maps(inputs["laterals"], batch["zero"]),
+        "band transformers": lambda: [net.bands(inputs["fpv"])[0]],
         "U-Net": lambda: [net.decoder(inputs["bev"][0])],
     }
 

@@ -65,7 +65,9 @@ class MultiHeadAttention(nn.Module):
 
     def mix(self, queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """The paper's Eqs. 3 and 4 per head -> (N, P, d), attention (N, heads, P, R)."""
-        attention = (queries * queries.shape[-1] ** -0.5 @ keys.transpose(-1, -2)).softmax(-1)
+        logits = queries * queries.shape[-1] ** -0.5 @ keys.transpose(-1, -2)
+        with torch.autocast(logits.device.type, enabled=False):  # autocast would copy to float32 and back
+            attention = logits.softmax(-1)
         return self.out((attention @ values).transpose(1, 2).flatten(2)), attention
 
     def within(self, x: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:

@@ -39,7 +39,8 @@ def noisy_or(logits: Tensor, values: Tensor) -> Tensor:
     """
     if bool(((values == 0) | (values == 1)).all()):
         # log (1 - g h) = h log (1 - g): one matrix product for all modalities
-        closed = -F.softplus(logits) @ values.to(logits.dtype)
+        with torch.autocast(logits.device.type, enabled=False):
+            closed = -(F.softplus(logits) @ values.to(logits.dtype))
     else:
         gates = logits.sigmoid().float().clamp(max=1 - 1e-6)
         closed = torch.stack([torch.log1p(-gates * h[..., None, :]).sum(-1) for h in values.unbind(-1)], dim=-1)
@@ -64,8 +65,9 @@ class Gates(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Finest features (B, width, R, C) -> logits (B, W, P, H); position p is map row p, top row first."""
-        fine = F.pixel_shuffle(self.head(features), self.stride)[..., : self.side, : self.side]  # B P H W
-        return fine.permute(0, 3, 1, 2) + self.prior
+        logits = self.head(features).unflatten(1, (-1, self.stride, self.stride))  # B P s s R C
+        fine = logits.permute(0, 5, 3, 1, 4, 2).flatten(4).flatten(1, 2)[:, : self.side, :, : self.side]  # B W P H
+        return fine + self.prior.to(fine.dtype)
 
 
 class MaxPoolZeroBEV(BevModel):
@@ -112,9 +114,9 @@ class MaxPoolZeroBEV(BevModel):
 
     def map_features(self, features: Tensor, gates: Tensor) -> Tensor:
         """RGB features (B, d, R, C) on the map, (B, d, M, M): their mean, weighted with the gates."""
-        stride, rows = self.config.stem_stride, features.shape[-2]
-        open_ = gates[:, ::stride].sigmoid()  # B C P H
-        open_ = F.pad(open_, (0, rows * stride - open_.shape[-1])).unflatten(-1, (rows, stride)).mean(-1)
-        weights = open_ / (open_.sum(-1, keepdim=True) + 0.01)
-        values = self.values(features).permute(0, 3, 2, 1)  # B C R d
-        return self.resample_features(weights.to(values.dtype) @ values)[0].permute(0, 3, 1, 2)
+        stride, side = self.config.stem_stride, gates.shape[-1]
+        values = F.pad(self.values(features), (0, 0, 0, 0, 0, 1), value=1.0)  # the last channel sums the weights
+        per_pixel = values.permute(0, 3, 2, 1).repeat_interleave(stride, 2)[:, :, :side]  # B C H d+1
+        sums = gates[:, ::stride].to(values.dtype).sigmoid() @ per_pixel  # B C P d+1
+        means = sums[..., :-1] / (sums[..., -1:] + 0.01 * stride)
+        return self.resample_features(means)[0].permute(0, 3, 1, 2)

@@ -1,5 +1,7 @@
 """The feature pyramid (Lin et al. 2017): the same width at every stride, with the context of coarser maps."""
 
+from collections.abc import Sequence
+
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -18,9 +20,26 @@ class FeaturePyramid(nn.Module):
             nn.init.kaiming_uniform_(layer.weight, a=1)
             nn.init.zeros_(layer.bias)
 
-    def forward(self, maps: list[Tensor]) -> list[Tensor]:
+    def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """Maps (N, channels[b], R_b, C_b), finest first, each half the size of the last -> (N, width, R_b, C_b)."""
-        merged = [lateral(features) for lateral, features in zip(self.laterals, maps)]
+        return self.top_down([lateral(features) for lateral, features in zip(self.laterals, maps)])
+
+    def first_laterals(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """The first input channels' part of the laterals, with the bias: (N, width, R_b, C_b)."""
+        weights, biases = self._lateral_parameters()
+        return [F.conv2d(m, weight[:, : m.shape[1]], bias) for m, weight, bias in zip(maps, weights, biases)]
+
+    def last_laterals(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """The last input channels' part of the laterals: (N, width, R_b, C_b). The two parts add up to the laterals."""
+        weights, _ = self._lateral_parameters()
+        return [F.conv2d(m, weight[:, -m.shape[1] :]) for m, weight in zip(maps, weights)]
+
+    def _lateral_parameters(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+        weights, biases = ([layer.get_parameter(name) for layer in self.laterals] for name in ("weight", "bias"))
+        return weights, biases
+
+    def top_down(self, merged: list[Tensor]) -> list[Tensor]:
+        """Laterals (N, width, R_b, C_b), finest first -> the pyramid's maps, same shapes."""
         for fine in range(len(merged) - 2, -1, -1):
             rows, columns = merged[fine].shape[-2:]
             # doubled and cropped, not stretched: coarse pixel i matches fine pixels 2i and 2i + 1 at odd sizes, too

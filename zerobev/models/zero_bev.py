@@ -51,27 +51,35 @@ class ZeroBEV(BevModel):
         if self.config.residual:
             assert depth is not None  # as checked
             images.append(inverse_project(zero, depth, self.camera))
-        rgb_maps = self.backbone(rgb)
+        laterals = self.rgb_laterals(rgb)
         parts = zip(*(image.split(max(1, IMAGES_PER_PASS // len(zero)), dim=1) for image in images))
-        logits = torch.cat([self.pass_images(rgb_maps, *part) for part in parts], dim=1)  # B K 1+aux M M
+        logits = torch.cat([self.pass_images(laterals, *part) for part in parts], dim=1)  # B K 1+aux M M
         return MapLogits(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None)
 
-    def pass_images(self, rgb_maps: Sequence[Tensor], zero: Tensor, projected: Tensor | None = None) -> Tensor:
-        """RGB features of B images, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).
+    def pass_images(self, laterals: Sequence[Tensor], zero: Tensor, projected: Tensor | None = None) -> Tensor:
+        """`rgb_laterals` of B images, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).
 
         projected: (B, K, M, M), P^-1 of the zero-shot images, in the residual variant
         """
-        features, _ = self.bands(self.pyramid(self.fpv_maps(rgb_maps, zero)))
+        features, _ = self.bands(self.fpv_maps(laterals, zero))
         if projected is not None:
             features = features + self.embedding(projected.flatten(0, 1)[:, None])
         return self.decoder(features).unflatten(0, zero.shape[:2])
 
-    def fpv_maps(self, rgb_maps: Sequence[Tensor], zero: Tensor) -> list[Tensor]:
-        """RGB features concatenated with those of each zero-shot image, (B * K, channels, R_b, C_b)."""
-        zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])
-        # repeating maps, even once, copies them and loses their layout, channels last
-        shared = rgb_maps if zero.shape[1] == 1 else [maps.repeat_interleave(zero.shape[1], 0) for maps in rgb_maps]
-        return [torch.cat(pair, dim=1) for pair in zip(shared, zero_maps)]
+    def rgb_laterals(self, rgb: Tensor) -> list[Tensor]:
+        """The part of the pyramid's laterals that depends on the RGB images alone, (B, width, R_b, C_b)."""
+        return self.pyramid.first_laterals(self.backbone(rgb))
+
+    def fpv_maps(self, laterals: Sequence[Tensor], zero: Tensor) -> list[Tensor]:
+        """The pyramid's maps of the RGB features concatenated with those of each zero-shot image, (B * K, width, ...).
+
+        The laterals are linear: their parts from the two images are added, and the first is computed once.
+        """
+        own = self.pyramid.last_laterals(self.zero_cnn(zero.flatten(0, 1)[:, None]))
+        k = zero.shape[1]
+        return self.pyramid.top_down(
+            [(o.unflatten(0, (-1, k)) + s[:, None]).flatten(0, 1) for o, s in zip(own, laterals)]
+        )
 
     def attention(self, rgb: Tensor, zero: Tensor) -> list[BandAttention]:
         """Attention for B RGB images and zero-shot images (B, 1, H, W), near band first.
@@ -80,4 +88,4 @@ class ZeroBEV(BevModel):
         the weights, per head and image row (top first), of position p (map row `band_rows(...)[band][p]`) of column c.
         """
         self.check(rgb=(rgb, 3), zero=(zero, 1))
-        return self.bands(self.pyramid(self.fpv_maps(self.backbone(rgb), zero)))[1]
+        return self.bands(self.fpv_maps(self.rgb_laterals(rgb), zero))[1]

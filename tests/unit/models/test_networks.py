@@ -70,6 +70,19 @@ def test_pyramid_keeps_odd_sizes_and_aligns_coarse_and_fine_pixels():
     assert changed.min(0).values.tolist() == [17, 11] and changed.max(0).values.tolist() == [20, 14]
 
 
+@torch.no_grad()
+def test_laterals_of_two_images_add_up_to_those_of_their_concatenated_features():
+    """So the RGB image's part serves all its zero-shot images."""
+    net, (rgb, zero) = network(), images(2, 3)
+    expected = [
+        net.pyramid([torch.cat(pair, dim=1) for pair in zip(net.backbone(rgb), net.zero_cnn(zero[:, k : k + 1]))])
+        for k in range(3)
+    ]
+    shared = net.fpv_maps(net.rgb_laterals(rgb), zero)
+    for maps, apart in zip(shared, zip(*expected)):
+        assert torch.allclose(maps.unflatten(0, (2, 3)), torch.stack(apart, dim=1), atol=1e-5)
+
+
 def test_columns_are_independent_and_attention_is_a_distribution():
     band = BandTransformer(16, 4, 32, 2, 0.0, rows=9, positions=5)
     columns = torch.randn(12, 9, 16)
@@ -131,13 +144,14 @@ def test_decoder_keeps_every_size(size):
 def test_maps_of_one_image_stay_channels_last():
     """In another layout they would be copied in every following convolution."""
     net = build("c", SMOKE.camera, SMOKE.model)
-    maps = net.fpv_maps(net.backbone(torch.rand(2, 3, 32, 32)), torch.rand(2, 1, 32, 32))
-    assert all(m.is_contiguous(memory_format=torch.channels_last) for m in (*maps, *net.pyramid(maps)))
+    laterals = net.rgb_laterals(torch.rand(2, 3, 32, 32))
+    maps = net.fpv_maps(laterals, torch.rand(2, 1, 32, 32))
+    assert all(m.is_contiguous(memory_format=torch.channels_last) for m in (*laterals, *maps))
 
 
 def test_map_features_are_zero_outside_the_view():
     net = network()
-    features, _ = net.bands(net.pyramid(net.fpv_maps(net.backbone(torch.rand(2, 3, 32, 32)), torch.rand(2, 1, 32, 32))))
+    features, _ = net.bands(net.fpv_maps(net.rgb_laterals(torch.rand(2, 3, 32, 32)), torch.rand(2, 1, 32, 32)))
     assert torch.equal((features != 0).any(1).all(0), net.bands.valid)
 
 
@@ -145,7 +159,7 @@ def test_map_features_are_zero_outside_the_view():
 def test_a_column_of_the_image_affects_only_its_rays():
     """In the far band, a change to one column of the finest map changes only cells within its view."""
     net = network()
-    maps = net.pyramid(net.fpv_maps(net.backbone(torch.rand(1, 3, 32, 32)), torch.rand(1, 1, 32, 32)))
+    maps = net.fpv_maps(net.rgb_laterals(torch.rand(1, 3, 32, 32)), torch.rand(1, 1, 32, 32))
     before, _ = net.bands(maps)
     maps[0] = maps[0].clone()
     maps[0][..., 11] += torch.randn(16, 16)

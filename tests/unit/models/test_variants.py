@@ -259,7 +259,7 @@ def test_the_residual_is_an_embedding_of_the_projection_added_to_the_map_feature
     net, (rgb, zero, depth), seen = network("d"), inputs(2, 3), []
     net.decoder.register_forward_pre_hook(lambda _, features: seen.append(features[0]))
     net(rgb, zero, depth)
-    features, _ = net.bands(net.pyramid(net.fpv_maps(net.backbone(rgb), zero)))
+    features, _ = net.bands(net.fpv_maps(net.rgb_laterals(rgb), zero))
     known = inverse_project(zero, depth, net.camera).flatten(0, 1)[:, None]  # N 1 M M
     assert 0.01 < known.mean() < 0.99
     weight, bias = net.embedding.weight[:, 0], net.embedding.bias[:, None, None]
