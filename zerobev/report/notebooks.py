@@ -18,18 +18,19 @@ from pathlib import Path
 
 import nbformat
 import papermill
-from filelock import FileLock, Timeout
 from nbclient.exceptions import DeadKernelError
 from nbconvert import HTMLExporter
 from nbformat import NotebookNode
 from papermill.exceptions import PapermillExecutionError
 
 from zerobev.common.errors import InputError
+from zerobev.common.locks import locked
 from zerobev.common.paths import PACKAGE_PARENT, report_name, zerobev_home
 from zerobev.common.storage import replacing
 from zerobev.config import SCALES, one_of
 
 NOTEBOOKS = PACKAGE_PARENT / "notebooks"
+_WORK = "run of this report"
 
 
 class NotebookError(Exception):
@@ -75,17 +76,6 @@ def environment(variables: dict[str, str]) -> Iterator[None]:
     finally:
         os.environ.clear()
         os.environ.update(before)
-
-
-@contextlib.contextmanager
-def only_run(logs: Path) -> Iterator[None]:
-    """Lock the folder `logs`, made if missing. Raises `InputError` if another process has locked it."""
-    logs.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(logs / ".lock", blocking=False):
-            yield
-    except Timeout:
-        raise InputError(f"{logs}: expected no other run of this report, found one at work") from None
 
 
 @contextlib.contextmanager
@@ -228,7 +218,7 @@ def reproduce(
 
     report = (reports or zerobev_home() / "reports") / report_name(scale, scenes)
     executed, logs = report / "notebooks", report / "logs"
-    with only_run(logs), environment(variables), shown_progress(logs / "progress.log"):
+    with locked(logs, _WORK), environment(variables), shown_progress(logs / "progress.log"):
         shutil.rmtree(executed, ignore_errors=True)  # of an earlier run
         for notebook in _progress(sources):
             copy = execute(notebook, executed / notebook.name, logs, parameters)
@@ -250,7 +240,7 @@ def refresh(notebooks: Path = NOTEBOOKS, reports: Path = PACKAGE_PARENT / "repor
     notebook, the tour, is copied to `reports/tour.png` for the README.
     """
     cache = zerobev_home() / ".cache/notebooks"
-    with only_run(cache), environment(kernel_settings()):
+    with locked(cache, _WORK), environment(kernel_settings()):
         for notebook in _progress(_notebooks_in(notebooks)):
             copy = execute(notebook, cache / notebook.name, cache, {})
             copy.metadata = {"kernelspec": copy.metadata.kernelspec, "language_info": {"name": "python"}}
