@@ -74,6 +74,11 @@ class Run:
             config |= {"extruded_fraction": wanted.extruded_fraction(scale)}
         return config
 
+    @property
+    def name(self) -> str:
+        """Row and seed."""
+        return f"{self.experiment.row} seed {self.seed}"
+
     @cached_property
     def key(self) -> str:
         """Row, seed, and fingerprint of the configuration."""
