@@ -2,7 +2,8 @@
 
 Reads `notebooks/` and the records of `reports/<report>/`; writes executed copies and their HTML into
 `reports/<report>/notebooks/`, and messages of kernels into `reports/<report>/logs/`. Notebooks run in order, with scale
-and scenes as parameters. After an interruption the same command continues with the recorded results.
+and scenes as parameters; missing rows of the tables are computed before, side by side. After an interruption the same
+command continues with the recorded results.
 """
 
 import argparse
@@ -10,6 +11,7 @@ import base64
 import contextlib
 import os
 import shutil
+import subprocess
 import sys
 import threading
 import time
@@ -34,7 +36,7 @@ _WORK = "run of this report"
 
 
 class NotebookError(Exception):
-    """A notebook failed; the message names the notebook, the cell and the error."""
+    """A notebook failed, or a row that it reads; the message names the notebook, the cell and the error."""
 
 
 def kernel_settings() -> dict[str, str]:
@@ -166,6 +168,19 @@ def write_page(notebook: NotebookNode, page: Path, log: Path) -> None:
         unfinished.write_text(HTMLExporter().from_notebook_node(notebook)[0], encoding="utf-8")
 
 
+def compute_rows(scale: str, scenes: str) -> None:
+    """Compute the missing rows of all tables side by side, before the notebooks read them one by one.
+
+    scenes: folder of HM3DSem scenes; "": generated homes
+    Raises `NotebookError` if a row failed.
+    """
+    # in a process of its own: this one needs no torch
+    command = [sys.executable, "-m", "zerobev", "run", "--all", "--scale", scale, "--scenes", scenes]
+    with subprocess.Popen(command) as rows:  # unlike `subprocess.run`, it is not killed while it ends its processes
+        if rows.wait() != 0:
+            raise NotebookError("rows of the tables: expected all to be computed, found some that failed")
+
+
 def _notebooks_in(folder: Path) -> list[Path]:
     found = sorted(folder.glob("*.ipynb"))
     if not found:
@@ -192,7 +207,7 @@ def reproduce(
     notebooks: Path = NOTEBOOKS,
     reports: Path | None = None,
 ) -> Path:
-    """Execute every notebook of the folder `notebooks`, in order of name, and return the report's folder.
+    """Compute the missing rows, execute every notebook of a folder in order of name, and return the report's folder.
 
     scale: name of a scale, the notebooks' parameter `SCALE`
     scenes: folder of HM3DSem scenes, the parameter `SCENES` as an absolute path; None (`""`): generated homes
@@ -200,7 +215,7 @@ def reproduce(
     fresh: compute all records again; kernels ignore records older than `ZEROBEV_FRESH`, the time of this call in
         seconds since 1970
     reports: folder of the reports; default: `reports` in `common.paths.zerobev_home()`
-    Raises `InputError` before anything is executed, `NotebookError` at the first notebook that fails.
+    Raises `InputError` before anything is executed, `NotebookError` if a row fails or at the first notebook that fails.
     """
     one_of("scale", scale, SCALES)
     for name, folder in (("scenes", scenes), ("textures", textures)):
@@ -218,11 +233,13 @@ def reproduce(
 
     report = (reports or zerobev_home() / "reports") / report_name(scale, scenes)
     executed, logs = report / "notebooks", report / "logs"
-    with locked(logs, _WORK), environment(variables), shown_progress(logs / "progress.log"):
+    with locked(logs, _WORK), environment(variables):
         shutil.rmtree(executed, ignore_errors=True)  # of an earlier run
-        for notebook in _progress(sources):
-            copy = execute(notebook, executed / notebook.name, logs, parameters)
-            write_page(copy, executed / f"{notebook.stem}.html", logs / f"{notebook.stem}.log")
+        compute_rows(scale, parameters["SCENES"])
+        with shown_progress(logs / "progress.log"):
+            for notebook in _progress(sources):
+                copy = execute(notebook, executed / notebook.name, logs, parameters)
+                write_page(copy, executed / f"{notebook.stem}.html", logs / f"{notebook.stem}.log")
     return report
 
 
