@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from zerobev import cli
 from zerobev.common.errors import InputError
+from zerobev.common.locks import locked
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, AgentConfig, CameraConfig, TextureConfig, TrainConfig
 from zerobev.data import generate as generation
@@ -31,7 +32,6 @@ from zerobev.evaluation.metrics import Counts
 from zerobev.experiments.run_records import RunStore
 from zerobev.models import build as build_network
 from zerobev.rendering.poses import navigable_floor
-from zerobev.report.notebooks import only_run
 from zerobev.scenes.hm3dsem import read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 from zerobev.scenes.scene import Scene
@@ -245,13 +245,17 @@ def test_training_goes_on_after_a_full_disk(tmp_path: Path) -> None:
     assert weights[0] == weights[1]
 
 
-def test_a_run_that_is_killed_frees_its_report(tmp_path: Path) -> None:
+def test_a_process_that_is_killed_frees_its_folder(tmp_path: Path) -> None:
     def work() -> None:
-        with only_run(tmp_path):
+        with locked(tmp_path, "work"):
             os.kill(os.getpid(), signal.SIGKILL)
 
     assert in_a_child(work) == -signal.SIGKILL
-    with only_run(tmp_path), pytest.raises(InputError, match="found one at work"), only_run(tmp_path):
+    with (
+        locked(tmp_path, "work"),
+        pytest.raises(InputError, match="no other work, found one"),
+        locked(tmp_path, "work"),
+    ):
         pass
 
 

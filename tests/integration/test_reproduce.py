@@ -9,6 +9,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import nbformat
 import pytest
@@ -45,7 +46,28 @@ def folders(tmp_path: Path) -> dict[str, Path]:
     return {"notebooks": tmp_path / "notebooks", "reports": tmp_path / "reports"}
 
 
-def test_parameters_settings_and_this_environment_reach_every_notebook(folders, tmp_path, monkeypatch, capfd):
+class Rows:
+    """Stands in for the process that computes rows: how it was called, with which settings, and how it ends."""
+
+    def __init__(self) -> None:
+        self.called: list[tuple[str, ...]] = []
+        self.settings: list[dict[str, str]] = []
+        self.code = 0
+
+    def __call__(self, command: list[str]) -> subprocess.Popen:
+        self.called.append(tuple(command[1:]))
+        self.settings.append(dict(os.environ))
+        return subprocess.Popen(["sh", "-c", f"exit {self.code}"])
+
+
+@pytest.fixture(autouse=True)
+def rows(monkeypatch: pytest.MonkeyPatch) -> Rows:
+    rows = Rows()
+    monkeypatch.setattr(workbook, "subprocess", SimpleNamespace(Popen=rows))
+    return rows
+
+
+def test_parameters_settings_and_this_environment_reach_every_notebook(folders, rows, tmp_path, monkeypatch, capfd):
     other = tmp_path / "user/kernels/python3/kernel.json"  # a kernel of the same name that the user has registered
     other.parent.mkdir(parents=True)
     other.write_text('{"argv": ["/bin/false"], "display_name": "other", "language": "python"}')
@@ -76,6 +98,18 @@ def test_parameters_settings_and_this_environment_reach_every_notebook(folders, 
         ["total", lines[2].split()[1]],
     ]
     assert "ZEROBEV_FRESH" not in os.environ
+    # the same settings reach the rows, before the notebooks
+    assert rows.called == [("-m", "zerobev", "run", "--all", "--scale", "smoke", "--scenes", str(homes))]
+    (settings,) = rows.settings
+    assert settings["ZEROBEV_TEXTURES"] == str(textures) and float(settings["ZEROBEV_FRESH"]) < time.time()
+
+
+def test_no_notebook_is_executed_after_a_row_that_failed(folders, rows):
+    write_notebook(folders["notebooks"] / "00_first.ipynb", "1")
+    rows.code = 1
+    with pytest.raises(NotebookError, match="rows of the tables: expected all to be computed, found some that failed"):
+        reproduce("smoke", **folders)
+    assert not (folders["reports"] / "smoke/notebooks").exists()
 
 
 def test_a_failing_notebook_ends_the_run_in_one_clear_line(folders, monkeypatch, capfd):

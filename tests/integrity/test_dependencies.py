@@ -21,7 +21,7 @@ GROUPS = ("core", "scenes", "workbook", "dev")
 #: Module or room of zerobev -> group; all others are core.
 GROUP_OF = {
     **dict.fromkeys(["common.parallel", "scenes", "rendering", "data", "evaluation"], "scenes"),
-    **dict.fromkeys(["training", "experiments", "benchmarks", "report"], "workbook"),
+    **dict.fromkeys(["common.locks", "training", "experiments", "benchmarks", "report"], "workbook"),
 }
 #: Commands and plug-ins without an import.
 TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "setuptools"}

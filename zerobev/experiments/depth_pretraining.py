@@ -75,12 +75,16 @@ class DepthPretraining:
 
     @cached_property
     def record(self) -> Record:
-        """Its record. Result: errors `mad_m` and `relative` on the test views, and the training curves."""
+        """Its record. Result: errors `mad_m` and `relative` on the test views, and the training curves.
+
+        Raises `InputError` if another process trains the estimator.
+        """
         record = self.recorded()
         if record is None:
-            record = self._compute()
-            if rank_and_world_size()[0] == 0:
-                write(self.path, record)
+            with self._workspace.alone(self.key):
+                record = self._compute()
+                if rank_and_world_size()[0] == 0:
+                    write(self.path, record)
         return record
 
     @cached_property

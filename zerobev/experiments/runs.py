@@ -74,6 +74,11 @@ class Run:
             config |= {"extruded_fraction": wanted.extruded_fraction(scale)}
         return config
 
+    @property
+    def name(self) -> str:
+        """Row and seed."""
+        return f"{self.experiment.row} seed {self.seed}"
+
     @cached_property
     def key(self) -> str:
         """Row, seed, and fingerprint of the configuration."""
@@ -119,7 +124,14 @@ class Run:
         return self.recorded() or self.compute(self.store)
 
     def compute(self, store: RunStore) -> RunRecord:
-        """Train, evaluate and write the record into `store`, even if it exists."""
+        """Train, evaluate and write the record into `store`, even if it exists.
+
+        Raises `InputError` if another process computes this run.
+        """
+        with self.workspace.alone(self.key):
+            return self._compute(store)
+
+    def _compute(self, store: RunStore) -> RunRecord:
         revision = git_revision()  # of the running code, before later commits
         camera = self.workspace.scale.camera
         history: History | None = None

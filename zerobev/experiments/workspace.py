@@ -6,6 +6,7 @@ Data lie in the ignored folder `.cache` and can be made again; results lie in `r
 import argparse
 import os
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 from zerobev import config
 from zerobev.common.errors import InputError
 from zerobev.common.keys import fingerprint
+from zerobev.common.locks import locked
 from zerobev.common.paths import report_name, zerobev_home
 from zerobev.common.settings import changed_by
 from zerobev.config import SCALES, SPLITS, Split, TextureConfig
@@ -28,6 +30,7 @@ from zerobev.scenes.hm3dsem import SceneFolders
 from zerobev.scenes.homes import ensure_home, ensure_homes, home_folders
 from zerobev.scenes.readers import read_scene, split_scenes
 from zerobev.scenes.scene import Scene
+from zerobev.training.distributed import rank_and_world_size
 
 
 def add_workspace_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,6 +91,10 @@ class Workspace:
     def runs(self) -> Path:
         """Folder of checkpoints and logs."""
         return self.cache / "runs" / self.reports.name
+
+    def alone(self, key: str) -> AbstractContextManager[None]:
+        """Lock the folder of a run for this launch, see `common.locks.locked`; rank 0 holds the lock for all ranks."""
+        return locked(self.runs / key, "process with this run") if rank_and_world_size()[0] == 0 else nullcontext()
 
     @cached_property
     def views_folder(self) -> Path:

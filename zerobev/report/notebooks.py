@@ -2,7 +2,8 @@
 
 Reads `notebooks/` and the records of `reports/<report>/`; writes executed copies and their HTML into
 `reports/<report>/notebooks/`, and messages of kernels into `reports/<report>/logs/`. Notebooks run in order, with scale
-and scenes as parameters. After an interruption the same command continues with the recorded results.
+and scenes as parameters; missing rows of the tables are computed before, side by side. After an interruption the same
+command continues with the recorded results.
 """
 
 import argparse
@@ -10,6 +11,7 @@ import base64
 import contextlib
 import os
 import shutil
+import subprocess
 import sys
 import threading
 import time
@@ -18,22 +20,23 @@ from pathlib import Path
 
 import nbformat
 import papermill
-from filelock import FileLock, Timeout
 from nbclient.exceptions import DeadKernelError
 from nbconvert import HTMLExporter
 from nbformat import NotebookNode
 from papermill.exceptions import PapermillExecutionError
 
 from zerobev.common.errors import InputError
+from zerobev.common.locks import locked
 from zerobev.common.paths import PACKAGE_PARENT, report_name, zerobev_home
 from zerobev.common.storage import replacing
 from zerobev.config import SCALES, one_of
 
 NOTEBOOKS = PACKAGE_PARENT / "notebooks"
+_WORK = "run of this report"
 
 
 class NotebookError(Exception):
-    """A notebook failed; the message names the notebook, the cell and the error."""
+    """A notebook failed, or a row that it reads; the message names the notebook, the cell and the error."""
 
 
 def kernel_settings() -> dict[str, str]:
@@ -75,17 +78,6 @@ def environment(variables: dict[str, str]) -> Iterator[None]:
     finally:
         os.environ.clear()
         os.environ.update(before)
-
-
-@contextlib.contextmanager
-def only_run(logs: Path) -> Iterator[None]:
-    """Lock the folder `logs`, made if missing. Raises `InputError` if another process has locked it."""
-    logs.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(logs / ".lock", blocking=False):
-            yield
-    except Timeout:
-        raise InputError(f"{logs}: expected no other run of this report, found one at work") from None
 
 
 @contextlib.contextmanager
@@ -176,6 +168,19 @@ def write_page(notebook: NotebookNode, page: Path, log: Path) -> None:
         unfinished.write_text(HTMLExporter().from_notebook_node(notebook)[0], encoding="utf-8")
 
 
+def compute_rows(scale: str, scenes: str) -> None:
+    """Compute the missing rows of all tables side by side, before the notebooks read them one by one.
+
+    scenes: folder of HM3DSem scenes; "": generated homes
+    Raises `NotebookError` if a row failed.
+    """
+    # in a process of its own: this one needs no torch
+    command = [sys.executable, "-m", "zerobev", "run", "--all", "--scale", scale, "--scenes", scenes]
+    with subprocess.Popen(command) as rows:  # unlike `subprocess.run`, it is not killed while it ends its processes
+        if rows.wait() != 0:
+            raise NotebookError("rows of the tables: expected all to be computed, found some that failed")
+
+
 def _notebooks_in(folder: Path) -> list[Path]:
     found = sorted(folder.glob("*.ipynb"))
     if not found:
@@ -202,7 +207,7 @@ def reproduce(
     notebooks: Path = NOTEBOOKS,
     reports: Path | None = None,
 ) -> Path:
-    """Execute every notebook of the folder `notebooks`, in order of name, and return the report's folder.
+    """Compute the missing rows, execute every notebook of a folder in order of name, and return the report's folder.
 
     scale: name of a scale, the notebooks' parameter `SCALE`
     scenes: folder of HM3DSem scenes, the parameter `SCENES` as an absolute path; None (`""`): generated homes
@@ -210,7 +215,7 @@ def reproduce(
     fresh: compute all records again; kernels ignore records older than `ZEROBEV_FRESH`, the time of this call in
         seconds since 1970
     reports: folder of the reports; default: `reports` in `common.paths.zerobev_home()`
-    Raises `InputError` before anything is executed, `NotebookError` at the first notebook that fails.
+    Raises `InputError` before anything is executed, `NotebookError` if a row fails or at the first notebook that fails.
     """
     one_of("scale", scale, SCALES)
     for name, folder in (("scenes", scenes), ("textures", textures)):
@@ -228,11 +233,13 @@ def reproduce(
 
     report = (reports or zerobev_home() / "reports") / report_name(scale, scenes)
     executed, logs = report / "notebooks", report / "logs"
-    with only_run(logs), environment(variables), shown_progress(logs / "progress.log"):
+    with locked(logs, _WORK), environment(variables):
         shutil.rmtree(executed, ignore_errors=True)  # of an earlier run
-        for notebook in _progress(sources):
-            copy = execute(notebook, executed / notebook.name, logs, parameters)
-            write_page(copy, executed / f"{notebook.stem}.html", logs / f"{notebook.stem}.log")
+        compute_rows(scale, parameters["SCENES"])
+        with shown_progress(logs / "progress.log"):
+            for notebook in _progress(sources):
+                copy = execute(notebook, executed / notebook.name, logs, parameters)
+                write_page(copy, executed / f"{notebook.stem}.html", logs / f"{notebook.stem}.log")
     return report
 
 
@@ -250,7 +257,7 @@ def refresh(notebooks: Path = NOTEBOOKS, reports: Path = PACKAGE_PARENT / "repor
     notebook, the tour, is copied to `reports/tour.png` for the README.
     """
     cache = zerobev_home() / ".cache/notebooks"
-    with only_run(cache), environment(kernel_settings()):
+    with locked(cache, _WORK), environment(kernel_settings()):
         for notebook in _progress(_notebooks_in(notebooks)):
             copy = execute(notebook, cache / notebook.name, cache, {})
             copy.metadata = {"kernelspec": copy.metadata.kernelspec, "language_info": {"name": "python"}}

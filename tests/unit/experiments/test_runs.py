@@ -10,6 +10,7 @@ import torch
 
 from zerobev.common.errors import InputError
 from zerobev.common.keys import plain
+from zerobev.common.locks import locked
 from zerobev.config import SCALES, SceneConfig, TextureConfig, TrainConfig
 from zerobev.data.samples import as_float, semantic_batches
 from zerobev.experiments import runs
@@ -248,6 +249,15 @@ def test_spot_check_agrees_only_with_an_unchanged_record(workspace):
         path.write_text(original)
     with pytest.raises(InputError, match=r"expected one of the recorded rows a\.1, a\.2, c, d, found 'z'"):
         spot_check(workspace, "z")
+
+
+def test_a_training_is_not_computed_twice_at_a_time(workspace, monkeypatch):
+    run = Run(ZERO_BEV, workspace)
+    monkeypatch.setenv("ZEROBEV_FRESH", "9e9")  # no record is new enough
+    for folder in run.folder, workspace.runs / run.pretraining.key:
+        refused = pytest.raises(InputError, match=f"{folder}: expected no other process with this run, found one")
+        with locked(folder, "work"), refused:
+            run.record() if folder == run.folder else run.pretraining.record
 
 
 def test_a_scene_folder_that_is_missing_is_named(tmp_path):
