@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from zerobev.scenes.indoor import surfaces
-from zerobev.scenes.indoor.furniture import clutter, plants, screens, seating, storage, tables
+from zerobev.scenes.indoor.furniture import clutter, household, plants, screens, seating, storage, tables
 from zerobev.scenes.indoor.furniture.piece import Piece
 from zerobev.scenes.indoor.light import Lamp
-from zerobev.scenes.indoor.plan import HEAD_M, along
-from zerobev.scenes.indoor.solids import Solid
+from zerobev.scenes.indoor.plan import along, side_frame
+from zerobev.scenes.indoor.shell import door_frame
+from zerobev.scenes.indoor.solids import LONGEST_M, Solid
 from zerobev.scenes.indoor.space import Design, Placed, Space
 
 _EVERY_WAY = np.zeros(3)
@@ -159,18 +160,21 @@ def television(space: Space, low: Placed | None) -> Placed | None:
     return low
 
 
-def workplace(space: Space, screen: float) -> Placed | None:
-    """A desk with its chair, sometimes a monitor, and things on it."""
+def workplace(space: Space, screen: float, free: bool = False) -> Placed | None:
+    """A desk with its chair, sometimes a monitor, and things on it; at a wall unless `free`."""
     rng = space.rng
     table = tables.desk(rng)
     chair = (seating.office_chair if rng.random() < 0.75 else seating.shell_chair)(rng)
     depth, reach = float(table.bounds[1, 1]), float(chair.bounds[1, 1])
     x = rng.uniform(-0.1, 0.1)
     group = Piece(table.items + chair.moved(x, depth + reach + rng.uniform(0.0, 0.1), 0.0, np.pi).items, table.tops)
-    placed = space.against_wall(group, front=0.0) or space.against_wall(group, front=0.0)
+    if free:
+        placed = space.in_the_open(group)
+    else:
+        placed = space.against_wall(group, front=0.0) or space.against_wall(group, front=0.0)
     if placed is None:
         return None
-    top = table.tops[0]
+    top = placed.piece.tops[0]
     if rng.random() < screen:
         back = Placed(Piece([], [type(top)(top.x, (top.y[0], top.y[0] + 0.26), top.z)]), placed.x, placed.y, placed.yaw)
         space.on_top(back, (screens.monitor,), 1)
@@ -235,7 +239,7 @@ def seats(space: Space, fraction: float, mean: float, designs: Sequence[Design])
 def breast(space: Space) -> None:
     """A chimney breast or boxed pipes: a protruding piece of wall, annotated as an instance."""
     rng = space.rng
-    w, d, skin = rng.uniform(0.3, 1.1), rng.uniform(0.12, 0.35), surfaces.wall(rng, space.room.kind)
+    w, d, skin = rng.uniform(0.3, 1.1), rng.uniform(0.12, 0.35), space.style.wall(rng, space.room.kind)
     solid = Solid().box((-w / 2, w / 2), (0, d), (0, space.room.height - 0.002), skin, hide="btu")
     space.against_wall(Piece([("wall", solid)]), gap=0.006, front=0.2)
 
@@ -277,8 +281,10 @@ def ceiling_light(space: Space) -> None:
     x0, y0, x1, y1 = space.room.inner
     long = max(x1 - x0, y1 - y0)
     parts = [0.5] if long < 5.0 else [0.27, 0.73]
+    if long > LONGEST_M:
+        parts = ((np.arange(round(long / 4)) + 0.5) / round(long / 4)).tolist()
     seed = int(rng.integers(2**32))
-    glass = sum((o.end - o.start) * (HEAD_M - o.sill) for o in space.room.openings if o.window)
+    glass = sum((o.end - o.start) * (o.head - o.sill) for o in space.room.openings if o.window)
     dark = glass > 0.12 * space.room.area and rng.random() < 0.4
     power = rng.uniform(1.2, 3.2) / len(parts) ** 0.5
     for part in parts:
@@ -297,13 +303,74 @@ def curtains(space: Space) -> None:
         return
     cloth = surfaces.two_tone("folds", surfaces.fabric(rng).color, 0.75)
     for opening in space.room.openings:
-        if opening.window:
+        if opening.window and opening.head + 0.16 < space.room.height:
             start, end = along(space.room, opening)
+            head = opening.head
             low = 0.03 if opening.sill < 0.3 else opening.sill - 0.05
             for t in (start - 0.12, end + 0.12):
-                hanging = clutter.curtain(rng, cloth, 0.34, (low, HEAD_M + 0.12))
+                hanging = clutter.curtain(rng, cloth, 0.34, (low, head + 0.12))
                 space.drape("curtain", hanging, opening.side, t, low)
             rod = Solid().rod(
-                (0, 0.08, HEAD_M + 0.13), (end - start + 0.6, 0.08, HEAD_M + 0.13), 0.012, surfaces.metal(rng)
+                (0, 0.08, head + 0.13), (end - start + 0.6, 0.08, head + 0.13), 0.012, surfaces.metal(rng)
             )
-            space.drape("curtain rod", rod, opening.side, start - 0.3, HEAD_M)
+            space.drape("curtain rod", rod, opening.side, start - 0.3, head)
+
+
+def structure(space: Space) -> None:
+    """Often columns and beams on a grid of a hall, and a lamp in each bay."""
+    rng, room = space.rng, space.room
+    x0, y0, x1, y1 = room.inner
+    pitch = rng.uniform(3.2, 5.5)
+    xs, ys = (np.linspace(a, b, max(2, round((b - a) / pitch)) + 1) for a, b in ((x0, x1), (y0, y1)))
+    skin = space.style.wall(rng, room.kind) if rng.random() < 0.6 else surfaces.lacquer_or_wood(rng)
+    side, is_round = rng.uniform(0.22, 0.5), rng.random() < 0.35
+    column = Solid()
+    if is_round:
+        column.lathe([(side / 2, 0.0), (side / 2, room.height - 0.002)], (0.0, 0.0), skin, sides=12)
+    else:
+        half = (-side / 2, side / 2)
+        column.box(half, half, (0.0, room.height - 0.002), skin, hide="u")
+    if rng.random() < 0.6:
+        for x in xs[1:-1]:
+            for y in ys[1:-1]:
+                space.put(Placed(Piece([("column", column)]), float(x), float(y), 0.0))
+    if rng.random() < 0.5:
+        low, wide = room.height - rng.uniform(0.15, 0.4), rng.uniform(0.1, 0.3)
+        for x in xs[1:-1]:
+            span = (float(x) - wide / 2, float(x) + wide / 2)
+            space.items.append(("beam", Solid().box(span, (y0, y1), (low, room.height), skin, hide="tbf")))
+    seed, power = int(rng.integers(2**32)), rng.uniform(1.0, 3.5)
+    for x in (xs[1:] + xs[:-1]) / 2:
+        for y in (ys[1:] + ys[:-1]) / 2:
+            lamp = clutter.ceiling_lamp(np.random.default_rng(seed))
+            space.items += lamp.moved(float(x), float(y), room.height).items
+            low = room.height + float(lamp.bounds[0, 2]) - 0.06
+            _shine(space, Placed(Piece(lamp.items), float(x), float(y), 0.0), low, power)
+
+
+def shut_doors(space: Space, mean: float) -> None:
+    """Doors to places outside the home (number Poisson-distributed), with the floor in front of them free."""
+    rng = space.rng
+    for _ in range(int(rng.poisson(mean))):
+        width, head = rng.uniform(0.75, 1.0), rng.uniform(1.96, 2.15)
+        skin, metal = surfaces.lacquer_or_wood(rng), surfaces.metal(rng)
+        leaf = Solid().box((-width / 2, width / 2), (0.0, 0.018), (0.0, head), skin, hide="b")
+        grip = width / 2 - 0.07
+        leaf.rod((grip, 0.018, 1.0), (grip, 0.07, 1.0), 0.012, metal)
+        leaf.rod((grip + 0.01, 0.06, 1.0), (grip - 0.12, 0.06, 1.0), 0.011, metal)
+        frame = door_frame(-width / 2, width / 2, head, skin)
+        door = Piece([("door", leaf), ("door frame", frame)])
+        for _ in range(8):
+            side = int(rng.integers(4))
+            length = side_frame(space.room, side)[2]
+            if length > width + 0.4 and space.at_wall(
+                door, side, rng.uniform(width / 2 + 0.1, length - width / 2 - 0.1), gap=0.015, front=0.7
+            ):
+                break
+
+
+def mess(space: Space, count: int) -> None:
+    """Small things anywhere on the floor."""
+    designs = (*clutter.ON_FLOORS, clutter.box, clutter.shoes, clutter.book_pile, seating.stool, *household.IN_CLOSETS)
+    for _ in range(count):
+        space.in_the_open(designs[int(space.rng.integers(len(designs)))](space.rng))

@@ -37,6 +37,11 @@ class LightMap:
     shape: np.ndarray  #: (Q, 2) int: rows and columns of cells
     light: np.ndarray  #: (cells, 3) float32
 
+    @classmethod
+    def uniform(cls, quads: int) -> "LightMap":
+        """White light, one cell per quad."""
+        return cls(np.arange(quads + 1), np.ones((quads, 2), np.int64), np.ones((quads, 3), np.float32))
+
     def of(self, quad: int) -> np.ndarray:
         """(rows, columns, 3) of one quad."""
         return self.light[self.start[quad] : self.start[quad + 1]].reshape(*self.shape[quad], 3)
