@@ -320,7 +320,7 @@ def structure(space: Space) -> None:
     """Often columns and beams on a grid of a hall, and a lamp in each bay."""
     rng, room = space.rng, space.room
     x0, y0, x1, y1 = room.inner
-    pitch = rng.uniform(3.2, 5.5)
+    pitch = rng.uniform(2.6, 5.5)
     xs, ys = (np.linspace(a, b, max(2, round((b - a) / pitch)) + 1) for a, b in ((x0, x1), (y0, y1)))
     skin = space.style.wall(rng, room.kind) if rng.random() < 0.6 else surfaces.lacquer_or_wood(rng)
     side, is_round = rng.uniform(0.22, 0.5), rng.random() < 0.35
@@ -363,14 +363,16 @@ def shut_doors(space: Space, mean: float) -> None:
         for _ in range(8):
             side = int(rng.integers(4))
             length = side_frame(space.room, side)[2]
-            if length > width + 0.4 and space.at_wall(
-                door, side, rng.uniform(width / 2 + 0.1, length - width / 2 - 0.1), gap=0.015, front=0.7
-            ):
-                break
+            if length > width + 0.4:
+                t = rng.uniform(width / 2 + 0.1, length - width / 2 - 0.1)
+                placed = space.at_wall(door, side, t, gap=0.015, front=0.7)
+                if placed:
+                    space.keep_free(placed)
+                    break
 
 
 def mess(space: Space, count: int) -> None:
     """Small things anywhere on the floor."""
     designs = (*clutter.ON_FLOORS, clutter.box, clutter.shoes, clutter.book_pile, seating.stool, *household.IN_CLOSETS)
     for _ in range(count):
-        space.in_the_open(designs[int(space.rng.integers(len(designs)))](space.rng))
+        space.in_the_open(designs[int(space.rng.integers(len(designs)))](space.rng), everywhere=True)

@@ -100,10 +100,11 @@ def generate_home(name: str, rng: np.random.Generator, homes: Homes = "flats") -
     style = home.style
     if style.baked:
         frame = atlas.origin, atlas.right, atlas.down
-        light = bake(quads, *frame, size_m, faces, albedo, home.lamps, home.hidden, opaque)
-        textures = paint(atlas, home.hidden, home.materials, light, style.exposure, style.shoulder)
+        light = bake(quads, *frame, size_m, faces, albedo, home.lamps, home.hidden, opaque, style.directions)
+        light = light if style.key is None else light.exposed(albedo, style.key)
     else:
-        textures = paint(atlas, home.hidden, home.materials, LightMap.uniform(len(quads)), 1.0, 0.0)
+        light = LightMap.uniform(len(quads))
+    textures = paint(atlas, home.hidden, home.materials, light, style.exposure, style.shoulder)
     face_uv = atlas.uv[quad_of_face[:, None], corner]
     face_chart = atlas.chart[quad_of_face]
     vertices = home.quads.reshape(-1, 3)

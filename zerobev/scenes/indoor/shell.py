@@ -15,8 +15,8 @@ _SKIRTING_M = (0.014, 0.08)  # depth, height
 _SKY = (0.86, 0.92, 1.0)
 
 Item = tuple[str, Solid]
-#: Height and material of the lower part of walls.
-Panel = tuple[float, Material]
+#: Height and material of the skirting or panel of walls, and its invisible faces.
+Panel = tuple[float, Material, str]
 
 
 def build_shell(rng: np.random.Generator, room: Room, style: Style = FLATS) -> tuple[list[Item], list[Lamp]]:
@@ -27,7 +27,8 @@ def build_shell(rng: np.random.Generator, room: Room, style: Style = FLATS) -> t
     x0, y0, x1, y1 = room.outer
     items = [("floor", Solid().box((x0, x1), (y0, y1), (-_SLAB_M, 0.0), floor, hide="brflu"))]
     items.append(("ceiling", _ceiling(room, style.ceiling)))
-    panel = (style.panel_m, style.panel) if style.panel else (_SKIRTING_M[1], trim)
+    # door frames hide the ends of a skirting; passages have no frames
+    panel = (_SKIRTING_M[1], trim, "blr") if style is FLATS else (style.panel_m, style.panel or trim, "b")
     lamps = []
     for side in range(4):
         origin, yaw, length = side_frame(room, side)
@@ -75,16 +76,17 @@ def _walls(room: Room, side: int, length: float, openings: list, wall: Material,
         _skirting(part, max(at, 0.0), min(start, length), panel)
         if opening is not None and opening.window:
             part.box((start, end), (-depth, 0.0), (0.0, opening.sill), wall, hide="blr")
-            _skirting(part, start, end, (min(panel[0], max(opening.sill, _SKIRTING_M[1])), panel[1]))
+            low = min(panel[0], max(opening.sill, _SKIRTING_M[1]))
+            _skirting(part, start, end, (low, *panel[1:]))
         parts.append(part)
         at, before = end, head
     return parts
 
 
 def _skirting(solid: Solid, start: float, end: float, panel: Panel) -> None:
-    height, material = panel
+    height, material, hide = panel
     if end - start > 0.1:
-        solid.box((start, end), (0.0, _SKIRTING_M[0]), (0.0, height), material, hide="blr")
+        solid.box((start, end), (0.0, _SKIRTING_M[0]), (0.0, height), material, hide=hide)
 
 
 def door_frame(start: float, end: float, head: float, trim: Material) -> Solid:

@@ -175,7 +175,7 @@ class Space:
             return None
         piece = self._stretched(piece)
         if self.style.loose and piece.items[0][0] in _MOVABLE and self.rng.random() < self.style.loose:
-            return self._anywhere(piece)
+            return self._anywhere(piece, everywhere=True)
         (x0, _, _), (x1, _, _) = piece.bounds
         for _ in range(_TRIES):
             side = sides[int(self.rng.integers(len(sides)))]
@@ -204,18 +204,24 @@ class Space:
             self._on_wall.append((side, t + x0, t + x1, 0.0, float(height)))
         return placed
 
-    def in_the_open(self, piece: Piece) -> Placed | None:
-        """Place a piece anywhere, preferably near the middle of a room that is not a hall."""
-        return None if self._is_left_out() else self._anywhere(self._stretched(piece))
+    def keep_free(self, placed: Placed) -> None:
+        """Reserve the floor in front of a piece at a wall."""
+        (x0, _, _), (x1, _, _) = placed.piece.bounds
+        start, end = placed.along + float(x0), placed.along + float(x1)
+        self._rectangles.append(floor_before(self.room, placed.side, start, end, _DOOR_M))
 
-    def _anywhere(self, piece: Piece) -> Placed | None:
+    def in_the_open(self, piece: Piece, everywhere: bool = False) -> Placed | None:
+        """Place a piece anywhere, preferably near the middle of the room unless `everywhere`."""
+        return None if self._is_left_out() else self._anywhere(self._stretched(piece), everywhere)
+
+    def _anywhere(self, piece: Piece, everywhere: bool) -> Placed | None:
         x0, y0, x1, y1 = self.room.inner
         lower, upper = piece.bounds
         for attempt in range(_TRIES):
             yaw = float(self.rng.integers(4)) * np.pi / 2
             if self.style.askew and self.rng.random() < self.style.askew:
                 yaw += float(self.rng.uniform(-np.pi / 4, np.pi / 4))
-            spread = 0.95 if self.room.kind in HALLS else 0.1 + 0.8 * attempt / _TRIES
+            spread = 0.95 if everywhere or self.room.kind in HALLS else 0.1 + 0.8 * attempt / _TRIES
             x = (x0 + x1) / 2 + self.rng.uniform(-0.5, 0.5) * spread * (x1 - x0)
             y = (y0 + y1) / 2 + self.rng.uniform(-0.5, 0.5) * spread * (y1 - y0)
             shift = Placed(piece, 0.0, 0.0, yaw).to_world(*((lower + upper)[:2] / 2))

@@ -26,8 +26,8 @@ class Style:
     floor: Surface = surfaces.floor
     wall: Surface = surfaces.wall
     ceiling: Material = _WHITE
-    panel: Material | None = None  #: of the lower part of walls
-    panel_m: float = 0.0  #: its height
+    panel: Material | None = None  #: of the skirting, or of the lower part of walls; None: a skirting per room
+    panel_m: float = 0.08  #: its height
     saturation: float = 1.0  #: factor on the saturation of all colours
     gamma: float = 1.0  #: exponent of all colours; less than 1 is lighter
     contrast: float = 1.0  #: factor on the contrast of all patterns; 0: no patterns
@@ -44,8 +44,10 @@ class Style:
     cast: Color = (1.0, 1.0, 1.0)  #: factor on the colour of all light
     uneven: float = 0.0  #: spread of brightness and colour among lamps
     pane: Material | None = None  #: of window panes
-    exposure: float = 1.5  #: of photographs, see `paint`
+    key: float | None = None  #: median brightness of large surfaces, linear; None: no automatic exposure
+    exposure: float = 1.5  #: see `paint`
     shoulder: float = 0.9
+    directions: int = 8  #: of reflected light, see `bake`
     baked: bool = True  #: False: the textures have no light, photographs are taken with a lamp at the camera
 
     def of(self, name: str, material: Material) -> Material:
@@ -153,7 +155,7 @@ def _filled(rng: np.random.Generator, style: Style) -> Style:
         return replace(style, kept=float(rng.uniform(0.04, 0.2)))
     if amount < 0.25:
         return replace(style, kept=float(rng.uniform(0.3, 0.7)))
-    return replace(style, extra=float(rng.uniform(0.2, 0.9))) if amount > 0.75 else style
+    return replace(style, extra=float(rng.uniform(0.1, 0.6))) if amount > 0.75 else style
 
 
 def _lit(rng: np.random.Generator, style: Style) -> Style:
@@ -166,15 +168,18 @@ def _lit(rng: np.random.Generator, style: Style) -> Style:
         Material("foliage", (0.75, 0.85, 0.95), (0.25, 0.4, 0.2), glow=True),
         Material("painting", (0.7, 0.75, 0.8), (0.5, 0.45, 0.4), glow=True),
     )
-    style = replace(style, pane=outside[rng.integers(4)])
+    if kind == "none":
+        return replace(style, baked=False, pane=outside[rng.integers(4)], exposure=1.0, shoulder=0.0)
+    style = replace(style, pane=outside[rng.integers(4)], key=float(rng.uniform(0.15, 0.4)), exposure=1.0, shoulder=0.6)
+    style = replace(style, directions=32)
     if kind == "bright":
-        style = replace(style, day=float(rng.uniform(2, 5)), exposure=float(rng.uniform(2.0, 4.5)), shoulder=0.5)
-        return replace(style, pane=outside[1])
+        key, day = float(rng.uniform(0.35, 0.7)), float(rng.uniform(1, 4))
+        return replace(style, day=day, key=key, shoulder=float(rng.uniform(0, 0.3)), pane=outside[1])
     if kind == "dark":
         night = surfaces.glowing((0.03, 0.04, 0.07) if rng.random() < 0.5 else (0.45, 0.5, 0.6))
-        return replace(style, day=0.05, lamp=float(rng.uniform(0.1, 0.5)), pane=night)
+        return replace(style, day=0.1, key=float(rng.uniform(0.02, 0.08)), pane=night)
     if kind == "cast":
         return replace(style, cast=_CASTS[rng.integers(len(_CASTS))])
     if kind == "uneven":
         return replace(style, uneven=float(rng.uniform(0.5, 1.2)))
-    return replace(style, baked=kind == "even")
+    return style
