@@ -21,6 +21,8 @@ from zerobev.scenes.indoor.plan import (
     without_clashes,
 )
 
+#: Depth of the floor in front of a door without another door's leaf, metres; two leaves leave a way between them.
+_LANDING_M = 1.4
 _OPEN = ("living room", "dining room", "kitchen", "hall")
 #: Kinds of the hall, and of the rooms on the sides of a hall or corridor with their probabilities, by use.
 _USES = (
@@ -46,7 +48,7 @@ def draw_building(rng: np.random.Generator) -> list[Room]:
                 _join(room, other)
     glass = rng.random() < 0.4
     for room in rooms:
-        room.openings = without_clashes(room)
+        room.openings = without_clashes(room, _LANDING_M)
         front = _glass_front(rng, room) if glass else None
         top = float(rng.uniform(2.0, min(room.height - 0.1, 2.6)))
         others = _rows_of_windows(rng, room) if room.kind in HALLS else windows(rng, room)

@@ -125,13 +125,13 @@ def overlap(a: Rectangle, b: Rectangle) -> bool:
     return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
 
 
-def without_clashes(room: Room) -> list[Opening]:
-    """A room's openings, without leaves in front of another door or in a shallow room."""
+def without_clashes(room: Room, landing_m: float = _LANDING_M) -> list[Opening]:
+    """A room's openings, without leaves closer than `landing_m` in front of another door, or in a shallow room."""
     doors = [o for o in room.openings if not o.window]
     kept = []
     for opening in room.openings:
         if opening.leaf:
-            others = [floor_before(room, o.side, *along(room, o), _LANDING_M) for o in doors if o is not opening]
+            others = [floor_before(room, o.side, *along(room, o), landing_m) for o in doors if o is not opening]
             x0, y0, x1, y1 = room.inner
             depth = (y1 - y0) if opening.side in (0, 2) else (x1 - x0)
             if depth < 2.0 or any(overlap(leaf_floor(room, opening), other) for other in others):

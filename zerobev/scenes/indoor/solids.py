@@ -139,6 +139,13 @@ class Solid:
         self._materials.extend(other._materials)
         return self
 
+    def uncovered(self) -> "Solid":
+        """A copy without hidden quads."""
+        solid = Solid()
+        solid._quads, solid._materials = self._quads, self._materials
+        solid._hidden = [np.zeros_like(hidden) for hidden in self._hidden]
+        return solid
+
     def stretched(self, factor: np.ndarray) -> "Solid":
         """A copy with each axis scaled by `factor` (3,) about the origin."""
         solid = Solid()

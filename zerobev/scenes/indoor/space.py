@@ -175,7 +175,7 @@ class Space:
             return None
         piece = self._stretched(piece)
         if self.style.loose and piece.items[0][0] in _MOVABLE and self.rng.random() < self.style.loose:
-            return self._anywhere(piece, everywhere=True)
+            return self._anywhere(piece.uncovered(), everywhere=True)
         (x0, _, _), (x1, _, _) = piece.bounds
         for _ in range(_TRIES):
             side = sides[int(self.rng.integers(len(sides)))]

@@ -35,6 +35,10 @@ class Piece:
         """The piece at another pose, without its tops."""
         return Piece([(name, Solid().join(solid, (x, y, z), yaw)) for name, solid in self.items])
 
+    def uncovered(self) -> "Piece":
+        """The piece with its back visible."""
+        return Piece([(name, solid.uncovered()) for name, solid in self.items], self.tops)
+
     def stretched(self, factor: np.ndarray) -> "Piece":
         """The piece with each axis scaled by `factor` (3,) about its origin."""
         x, y, z = factor.tolist()
