@@ -5,6 +5,7 @@ at every scale. Existing homes are not written again.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import joblib
@@ -54,13 +55,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `zerobev homes`."""
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, in HM3DSem layout")
     parser.add_argument("--scale", default="reduced", help=f"one of {', '.join(SCALES)} (default: reduced)")
+    parser.add_argument("--homes", default="flats", help="flats, or varied: many kinds of buildings (default: flats)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1, help="processes (default: 1)")
 
 
 def run(options: argparse.Namespace) -> None:
     """Write the homes of a scale."""
-    split = home_folders(options.out, scale(options.scale).scenes)
+    split = home_folders(options.out, replace(scale(options.scale).scenes, homes=options.homes))
     folders = [*split.train, *split.validation, *split.test]
     ensure_homes(folders, options.seed, options.workers)
     write_dataset_config(options.out, folders)

@@ -7,6 +7,7 @@ import pytest
 
 from zerobev.common.errors import InputError
 from zerobev.config import LABELS, AgentConfig, CameraConfig, SceneConfig
+from zerobev.geometry.cameras import Pose
 from zerobev.geometry.projection import fov_mask
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.poses import navigable_floor
@@ -64,6 +65,18 @@ def test_walls_on_the_map_have_textures():
         wall = (scene.instance_label[found.instance] == LABELS.index("wall")) & (found.distance > 1.9)
         assert wall.sum() > 5
         assert len(np.unique(found.atlas[wall])) > 0.8 * wall.sum()
+
+
+@pytest.mark.slow
+def test_columns_are_on_the_map_also_below_beams():
+    scene = generate_home("Varied0000000", np.random.default_rng([0, 140]), "varied")
+    columns = [instance.id for instance in scene.instances if instance.name == "column"]
+    assert columns and "beam" in {instance.name for instance in scene.instances}
+    caster, camera = RayCaster(scene), CameraConfig(fpv_px=8, bev_px=50)
+    for column in columns:
+        (x0, y0, _), (x1, y1, _) = scene.instance_bounds[column]
+        found = caster.bev(Pose((x0 + x1) / 2, (y0 + y1) / 2 - 1.0, 0.0, np.pi / 2), camera)
+        assert (found.instance == column).sum() * camera.cell_m**2 > 0.7 * (x1 - x0) * (y1 - y0)
 
 
 def test_all_kinds_of_buildings_and_styles_occur():

@@ -325,11 +325,11 @@ def structure(space: Space) -> None:
     skin = space.style.wall(rng, room.kind) if rng.random() < 0.6 else surfaces.lacquer_or_wood(rng)
     side, is_round = rng.uniform(0.22, 0.5), rng.random() < 0.35
     column = Solid()
+    foot, top = 0.004, room.height - 0.002  # a foot above the floor, so that a map's cut finds the column in a beam
     if is_round:
-        column.lathe([(side / 2, 0.0), (side / 2, room.height - 0.002)], (0.0, 0.0), skin, sides=12)
+        column.lathe([(side / 2, foot), (side / 2, top)], (0.0, 0.0), skin, sides=12)
     else:
-        half = (-side / 2, side / 2)
-        column.box(half, half, (0.0, room.height - 0.002), skin, hide="u")
+        column.box((-side / 2, side / 2), (-side / 2, side / 2), (foot, top), skin, hide="u")
     if rng.random() < 0.6:
         for x in xs[1:-1]:
             for y in ys[1:-1]:
