@@ -12,7 +12,7 @@ from zerobev.geometry.projection import fov_mask
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.poses import navigable_floor
 from zerobev.scenes.homes import ensure_home, home_folders
-from zerobev.scenes.indoor import arrange, generate_home
+from zerobev.scenes.indoor import fixtures, generate_home
 from zerobev.scenes.indoor.atlas import CHART_PX
 from zerobev.scenes.indoor.home import build_home
 from zerobev.scenes.indoor.plan import HALLS, along, floor_before, overlap
@@ -107,7 +107,7 @@ def test_halls_have_columns_and_beams_apart_from_doors():
     for seed in range(40):
         for hall in (room for room in plan("varied", seed) if room.kind in HALLS):
             space = Space(np.random.default_rng(seed), hall)
-            arrange.structure(space)
+            fixtures.structure(space)
             found |= {name for name, _ in space.items}
             doors = [floor_before(hall, o.side, *along(hall, o), 0.7) for o in hall.openings if not o.window]
             for name, solid in space.items:

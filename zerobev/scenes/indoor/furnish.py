@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zerobev.scenes.indoor import arrange
+from zerobev.scenes.indoor import arrange, fixtures
 from zerobev.scenes.indoor.furniture import bathroom as baths
 from zerobev.scenes.indoor.furniture import beds, clutter, household, seating, storage, tables
 from zerobev.scenes.indoor.light import Lamp
@@ -18,9 +18,9 @@ def furnish(rng: np.random.Generator, room: Room, style: Style = FLATS) -> tuple
     """A room's instances apart from its shell, in the world frame, and its lamps."""
     space = Space(rng, room, style)
     if room.kind in HALLS:
-        arrange.structure(space)
+        fixtures.structure(space)
     if style.shut:
-        arrange.shut_doors(space, style.shut)
+        fixtures.shut_doors(space, style.shut)
     if rng.random() < 0.4 and room.kind != "closet":
         arrange.breast(space)
     _ROOMS[room.kind](space)
