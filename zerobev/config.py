@@ -15,6 +15,8 @@ Split = Literal["train", "validation", "test"]
 Stream = Literal["synth", "modsem", "depthproj", "classes"]
 #: Depth input of a method.
 Depth = Literal["true", "estimated"]
+#: Generated homes: flats like each other, or a mixture of buildings, styles and light.
+Homes = Literal["flats", "varied"]
 #: Residual block of the RGB backbone.
 Block = Literal["basic", "bottleneck"]
 
@@ -115,6 +117,10 @@ class SceneConfig:
     test: int
     views: int  #: per scene
     seed: int = 0
+    homes: Homes = "flats"  #: kind of generated homes
+
+    def __post_init__(self) -> None:
+        one_of("homes", self.homes, Homes)
 
 
 @dataclass(frozen=True)

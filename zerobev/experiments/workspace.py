@@ -106,7 +106,9 @@ class Workspace:
         """Folders of the training, validation and test scenes; those of generated homes may not exist yet."""
         if self.source:
             return split_scenes(self.source)
-        return home_folders(self.cache / f"homes-{versions.DATA}-{self.scale.scenes.seed}", self.scale.scenes)
+        scenes = self.scale.scenes
+        kind = "" if scenes.homes == "flats" else f"{scenes.homes}-"
+        return home_folders(self.cache / f"homes-{kind}{versions.DATA}-{scenes.seed}", scenes)
 
     def scene(self, split: Split, index: int) -> Scene:
         """Scene number `index` of a split."""

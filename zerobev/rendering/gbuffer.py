@@ -45,7 +45,7 @@ class RayCaster:
     face below points down, or if the next face above points up and sides of the same instance are near. Ceilings by
     name (`is_ceiling`) are left out at any height, so that a low one does not hide the floor.
 
-    In generated homes the map is seen by a camera `bev_above_m` above the pinhole, as in the paper. Their ceilings face
+    In generated flats the map is seen by a camera `bev_above_m` above the pinhole, as in the paper. Their ceilings face
     down, with nothing above; lamps are therefore on the map, and recorded data depend on it.
     """
 

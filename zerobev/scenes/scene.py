@@ -45,7 +45,7 @@ class Scene:
 
     @property
     def generated(self) -> bool:
-        """Whether this is a home of `zerobev.scenes.homes`; only these have such names."""
+        """Whether this is a flat of `zerobev.scenes.homes`; only these have such names, not varied homes."""
         return re.fullmatch(r"([0-9]{5}-)?Home[0-9]{7}", self.name) is not None
 
     @cached_property

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from zerobev.scenes.indoor import surfaces
-from zerobev.scenes.indoor.furniture import clutter, plants, screens, seating, storage, tables
+from zerobev.scenes.indoor.furniture import clutter, household, plants, screens, seating, storage, tables
 from zerobev.scenes.indoor.furniture.piece import Piece
 from zerobev.scenes.indoor.light import Lamp
-from zerobev.scenes.indoor.plan import HEAD_M, along
-from zerobev.scenes.indoor.solids import Solid
+from zerobev.scenes.indoor.plan import along
+from zerobev.scenes.indoor.solids import LONGEST_M, Solid
 from zerobev.scenes.indoor.space import Design, Placed, Space
 
 _EVERY_WAY = np.zeros(3)
@@ -24,7 +24,7 @@ def first(space: Space, designs: Sequence[Design], **where) -> Placed | None:
     return None
 
 
-def _shine(space: Space, placed: Placed, z: float, power: float) -> None:
+def shine(space: Space, placed: Placed, z: float, power: float) -> None:
     """Add the light of a lamp at height `z`."""
     x, y = placed.to_world(0.0, float(placed.piece.bounds[:, 1].mean()))
     color = np.array([1.0, space.rng.uniform(0.82, 0.97), space.rng.uniform(0.6, 0.92)])
@@ -46,7 +46,7 @@ def bed(space: Space, designs: Sequence[Design]) -> Placed | None:
         if stand:
             for lamp in space.on_top(stand, (clutter.table_lamp,), 1):
                 if rng.random() < 0.5:
-                    _shine(space, lamp, float(stand.piece.tops[0].z + lamp.piece.bounds[1, 2] + 0.08), 0.25)
+                    shine(space, lamp, float(stand.piece.tops[0].z + lamp.piece.bounds[1, 2] + 0.08), 0.25)
             space.on_top(Placed(Piece([], [_front_half(stand)]), stand.x, stand.y, stand.yaw), clutter.ON_DESKS[1:], 1)
     if rng.random() < 0.55:
         x, y = placed.to_world(0.0, float(y1) * 0.45)
@@ -136,7 +136,7 @@ def lounge(space: Space) -> Placed | None:
                 continue
             for lamp in space.on_top(stand, (clutter.table_lamp, clutter.vase), 1):
                 if lamp.piece.items[0][0] == "table lamp":
-                    _shine(space, lamp, float(stand.piece.tops[0].z + lamp.piece.bounds[1, 2] + 0.08), 0.3)
+                    shine(space, lamp, float(stand.piece.tops[0].z + lamp.piece.bounds[1, 2] + 0.08), 0.3)
     return sofa
 
 
@@ -159,18 +159,21 @@ def television(space: Space, low: Placed | None) -> Placed | None:
     return low
 
 
-def workplace(space: Space, screen: float) -> Placed | None:
-    """A desk with its chair, sometimes a monitor, and things on it."""
+def workplace(space: Space, screen: float, free: bool = False) -> Placed | None:
+    """A desk with its chair, sometimes a monitor, and things on it; at a wall unless `free`."""
     rng = space.rng
     table = tables.desk(rng)
     chair = (seating.office_chair if rng.random() < 0.75 else seating.shell_chair)(rng)
     depth, reach = float(table.bounds[1, 1]), float(chair.bounds[1, 1])
     x = rng.uniform(-0.1, 0.1)
     group = Piece(table.items + chair.moved(x, depth + reach + rng.uniform(0.0, 0.1), 0.0, np.pi).items, table.tops)
-    placed = space.against_wall(group, front=0.0) or space.against_wall(group, front=0.0)
+    if free:
+        placed = space.in_the_open(group)
+    else:
+        placed = space.against_wall(group, front=0.0) or space.against_wall(group, front=0.0)
     if placed is None:
         return None
-    top = table.tops[0]
+    top = placed.piece.tops[0]
     if rng.random() < screen:
         back = Placed(Piece([], [type(top)(top.x, (top.y[0], top.y[0] + 0.26), top.z)]), placed.x, placed.y, placed.yaw)
         space.on_top(back, (screens.monitor,), 1)
@@ -197,7 +200,7 @@ def standing_lamp(space: Space) -> None:
     """A floor lamp in a corner, on or off."""
     placed = space.against_wall(clutter.floor_lamp(space.rng), corner=True, front=0.0)
     if placed and space.rng.random() < 0.6:
-        _shine(space, placed, float(placed.piece.bounds[1, 2]) + 0.08, 0.5)
+        shine(space, placed, float(placed.piece.bounds[1, 2]) + 0.08, 0.5)
 
 
 def company(rng: np.random.Generator, fraction: float, mean: float) -> int:
@@ -235,7 +238,7 @@ def seats(space: Space, fraction: float, mean: float, designs: Sequence[Design])
 def breast(space: Space) -> None:
     """A chimney breast or boxed pipes: a protruding piece of wall, annotated as an instance."""
     rng = space.rng
-    w, d, skin = rng.uniform(0.3, 1.1), rng.uniform(0.12, 0.35), surfaces.wall(rng, space.room.kind)
+    w, d, skin = rng.uniform(0.3, 1.1), rng.uniform(0.12, 0.35), space.style.wall(rng, space.room.kind)
     solid = Solid().box((-w / 2, w / 2), (0, d), (0, space.room.height - 0.002), skin, hide="btu")
     space.against_wall(Piece([("wall", solid)]), gap=0.006, front=0.2)
 
@@ -277,8 +280,10 @@ def ceiling_light(space: Space) -> None:
     x0, y0, x1, y1 = space.room.inner
     long = max(x1 - x0, y1 - y0)
     parts = [0.5] if long < 5.0 else [0.27, 0.73]
+    if long > LONGEST_M:
+        parts = ((np.arange(round(long / 4)) + 0.5) / round(long / 4)).tolist()
     seed = int(rng.integers(2**32))
-    glass = sum((o.end - o.start) * (HEAD_M - o.sill) for o in space.room.openings if o.window)
+    glass = sum((o.end - o.start) * (o.head - o.sill) for o in space.room.openings if o.window)
     dark = glass > 0.12 * space.room.area and rng.random() < 0.4
     power = rng.uniform(1.2, 3.2) / len(parts) ** 0.5
     for part in parts:
@@ -287,7 +292,7 @@ def ceiling_light(space: Space) -> None:
         space.items += piece.moved(x, y, space.room.height).items
         if not dark:
             centred = Placed(Piece(piece.items), x, y, 0.0)
-            _shine(space, centred, space.room.height + float(piece.bounds[0, 2]) - 0.06, power)
+            shine(space, centred, space.room.height + float(piece.bounds[0, 2]) - 0.06, power)
 
 
 def curtains(space: Space) -> None:
@@ -297,13 +302,21 @@ def curtains(space: Space) -> None:
         return
     cloth = surfaces.two_tone("folds", surfaces.fabric(rng).color, 0.75)
     for opening in space.room.openings:
-        if opening.window:
+        if opening.window and opening.head + 0.16 < space.room.height:
             start, end = along(space.room, opening)
+            head = opening.head
             low = 0.03 if opening.sill < 0.3 else opening.sill - 0.05
             for t in (start - 0.12, end + 0.12):
-                hanging = clutter.curtain(rng, cloth, 0.34, (low, HEAD_M + 0.12))
+                hanging = clutter.curtain(rng, cloth, 0.34, (low, head + 0.12))
                 space.drape("curtain", hanging, opening.side, t, low)
             rod = Solid().rod(
-                (0, 0.08, HEAD_M + 0.13), (end - start + 0.6, 0.08, HEAD_M + 0.13), 0.012, surfaces.metal(rng)
+                (0, 0.08, head + 0.13), (end - start + 0.6, 0.08, head + 0.13), 0.012, surfaces.metal(rng)
             )
-            space.drape("curtain rod", rod, opening.side, start - 0.3, HEAD_M)
+            space.drape("curtain rod", rod, opening.side, start - 0.3, head)
+
+
+def mess(space: Space, count: int) -> None:
+    """Small things anywhere on the floor."""
+    designs = (*clutter.ON_FLOORS, clutter.box, clutter.shoes, clutter.book_pile, seating.stool, *household.IN_CLOSETS)
+    for _ in range(count):
+        space.in_the_open(designs[int(space.rng.integers(len(designs)))](space.rng), everywhere=True)

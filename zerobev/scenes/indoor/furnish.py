@@ -4,25 +4,33 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zerobev.scenes.indoor import arrange
+from zerobev.scenes.indoor import arrange, fixtures
 from zerobev.scenes.indoor.furniture import bathroom as baths
 from zerobev.scenes.indoor.furniture import beds, clutter, household, seating, storage, tables
 from zerobev.scenes.indoor.light import Lamp
-from zerobev.scenes.indoor.plan import Room
+from zerobev.scenes.indoor.plan import HALLS, Room
 from zerobev.scenes.indoor.shell import Item
 from zerobev.scenes.indoor.space import Space
+from zerobev.scenes.indoor.style import FLATS, Style
 
 
-def furnish(rng: np.random.Generator, room: Room) -> tuple[list[Item], list[Lamp]]:
+def furnish(rng: np.random.Generator, room: Room, style: Style = FLATS) -> tuple[list[Item], list[Lamp]]:
     """A room's instances apart from its shell, in the world frame, and its lamps."""
-    space = Space(rng, room)
+    space = Space(rng, room, style)
+    if room.kind in HALLS:
+        fixtures.structure(space)
+    if style.shut:
+        fixtures.shut_doors(space, style.shut)
     if rng.random() < 0.4 and room.kind != "closet":
         arrange.breast(space)
     _ROOMS[room.kind](space)
     if rng.random() < 0.5 and room.kind != "closet":
         arrange.first(space, (clutter.radiator,), front=0.1)
-    arrange.ceiling_light(space)
+    if room.kind not in HALLS:
+        arrange.ceiling_light(space)
     arrange.curtains(space)
+    if style.extra:
+        arrange.mess(space, round(style.extra * room.area))
     return space.items, space.lamps
 
 
@@ -199,6 +207,66 @@ def _laundry_room(space: Space) -> None:
     arrange.on_walls(space, 0, 3)
 
 
+def _loft(space: Space) -> None:
+    """All of a home in one room."""
+    for zone in (_living_room, _kitchen, _bedroom, _dining_room, _office, _living_room)[
+        : 2 + int(space.room.area / 20)
+    ]:
+        zone(space)
+
+
+def _open_office(space: Space) -> None:
+    rng = space.rng
+    for _ in range(int(space.room.area / rng.uniform(6.0, 15.0))):
+        arrange.workplace(space, screen=0.7, free=rng.random() < 0.8)
+    for _ in range(int(space.room.area / 25)):
+        low = arrange.first(space, (storage.bookshelf, storage.drawers, storage.sideboard), front=0.3)
+        space.on_top(low, clutter.ON_SHELVES, 4)
+    if rng.random() < 0.6:
+        arrange.dining(space, (6, 8))
+    if rng.random() < 0.4:
+        arrange.lounge(space)
+    arrange.greenery(space, 0.7, 3.0)
+    arrange.on_walls(space, 2, 9)
+    arrange.on_floor(space, (clutter.basket, clutter.box), 2, 6)
+
+
+def _ward(space: Space) -> None:
+    rng = space.rng
+    for _ in range(int(space.room.area / rng.uniform(8.0, 16.0))):
+        arrange.bed(space, (beds.single_bed,))
+    arrange.seats(space, 0.8, 4.0, seating.DINING + seating.ARMCHAIRS)
+    for design in (storage.wardrobe, storage.wardrobe, storage.drawers, household.linen_shelf):
+        if rng.random() < 0.6:
+            space.against_wall(design(rng), front=0.4)
+    if rng.random() < 0.5:
+        arrange.television(space, None)
+    arrange.greenery(space, 0.4, 1.0)
+    arrange.on_walls(space, 1, 6)
+
+
+def _canteen(space: Space) -> None:
+    rng = space.rng
+    for _ in range(int(space.room.area / rng.uniform(8.0, 18.0))):
+        arrange.dining(space, (2, 4, 4, 6, 8))
+    if rng.random() < 0.5:
+        space.on_top(arrange.kitchen_row(space), clutter.ON_WORKTOPS, 8)
+    if rng.random() < 0.4:
+        arrange.television(space, None)
+    arrange.greenery(space, 0.6, 2.5)
+    arrange.on_walls(space, 2, 8)
+
+
+def _gallery(space: Space) -> None:
+    """Little furniture, many pictures."""
+    rng = space.rng
+    for _ in range(int(rng.integers(1, 6))):
+        space.in_the_open((seating.bench, seating.ottoman, tables.console, seating.corner_sofa)[rng.integers(4)](rng))
+    arrange.seats(space, 0.5, 2.0, seating.ARMCHAIRS)
+    arrange.greenery(space, 0.6, 2.5)
+    arrange.on_walls(space, 8, 20)
+
+
 _ROOMS: dict[str, Callable[[Space], None]] = {
     "bedroom": _bedroom,
     "bathroom": _bathroom,
@@ -209,4 +277,9 @@ _ROOMS: dict[str, Callable[[Space], None]] = {
     "hall": _hall,
     "closet": _closet,
     "laundry room": _laundry_room,
+    "loft": _loft,
+    "open office": _open_office,
+    "ward": _ward,
+    "canteen": _canteen,
+    "gallery": _gallery,
 }

@@ -8,15 +8,21 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from zerobev.config import Homes
 from zerobev.scenes.categories import label_of
 from zerobev.scenes.indoor.atlas import TEXELS_PER_M, Atlas, unwrap
+from zerobev.scenes.indoor.buildings import draw_building
 from zerobev.scenes.indoor.furnish import furnish
-from zerobev.scenes.indoor.light import Lamp, bake
+from zerobev.scenes.indoor.light import Lamp, LightMap, bake
 from zerobev.scenes.indoor.paint import paint
 from zerobev.scenes.indoor.plan import draw_plan
 from zerobev.scenes.indoor.shell import build_shell
-from zerobev.scenes.indoor.solids import Material, unseen
+from zerobev.scenes.indoor.solids import Material, tops_above, unseen
+from zerobev.scenes.indoor.style import FLATS, Style, draw_style
 from zerobev.scenes.scene import Instance, Scene
+
+#: Height of the cut through varied homes on the map; it shows surfaces that nobody sees.
+_CUT_M = 1.95
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,7 @@ class Home:
     hidden: np.ndarray  #: (Q,) bool
     materials: list[Material]  #: Q
     lamps: list[Lamp]
+    style: Style
 
     @property
     def instances(self) -> tuple[Instance, ...]:
@@ -42,12 +49,15 @@ class Home:
         return tuple(rows)
 
 
-def build_home(rng: np.random.Generator) -> Home:
+def build_home(rng: np.random.Generator, homes: Homes = "flats") -> Home:
     """A furnished floor plan."""
-    rooms = draw_plan(rng)
+    if homes == "flats":
+        style, rooms = FLATS, draw_plan(rng)
+    else:
+        style, rooms = draw_style(rng), draw_building(rng)
     names, regions, solids, lamps = [], [], [], []
     for region, room in enumerate(rooms):
-        for items, light in (build_shell(rng, room), furnish(rng, room)):
+        for items, light in (build_shell(rng, room, style), furnish(rng, room, style)):
             lamps.extend(light)
             for name, solid in items:
                 names.append(name)
@@ -55,33 +65,46 @@ def build_home(rng: np.random.Generator) -> Home:
                 solids.append(solid)
     counts = [len(solid.quads) for solid in solids]
     quads = np.concatenate([solid.quads for solid in solids]).astype(np.float32)
+    hidden = np.concatenate([solid.hidden for solid in solids]) | unseen(quads)
+    if homes == "varied":
+        hidden &= ~tops_above(quads, _CUT_M)
+        lamps = [style.shines(rng, lamp) for lamp in lamps]
     return Home(
         kinds=[room.kind for room in rooms],
         names=names,
         regions=regions,
         quads=quads,
         owner=np.repeat(np.arange(1, len(names) + 1), counts),
-        hidden=np.concatenate([solid.hidden for solid in solids]) | unseen(quads),
-        materials=[material for solid in solids for material in solid.materials],
+        hidden=hidden,
+        materials=[style.of(name, material) for name, solid in zip(names, solids) for material in solid.materials],
         lamps=lamps,
+        style=style,
     )
 
 
-def generate_home(name: str, rng: np.random.Generator) -> Scene:
+def generate_home(name: str, rng: np.random.Generator, homes: Homes = "flats") -> Scene:
     """A furnished home with atlas, annotation and photographed textures, in place of HM3DSem (paper, Section 5).
 
-    Kinds and numbers of rooms and furniture follow HM3DSem's. Light is baked into the textures (`unlit`). Ceilings face
-    down, all other solids are closed. Texels are 1 cm. The same state of `rng` gives the same bytes.
+    Kinds and numbers of rooms and furniture of "flats" follow HM3DSem's; "varied" homes differ more from each other: in
+    their plans, styles, light, amount and sizes of furniture. Light is baked into the textures (`unlit`), except in
+    some varied homes. Ceilings face down, all other solids are closed. Texels are 1 cm. The same state of `rng` gives
+    the same bytes.
     """
-    home = build_home(rng)
+    home = build_home(rng, homes)
     quads = home.quads.astype(np.float64)
     atlas = unwrap(quads, home.hidden)
     faces, quad_of_face, corner = _triangles(quads)
     size_m = np.stack([np.ptp(atlas.corners[:, :, axis], axis=1) for axis in (1, 0)], axis=1) / TEXELS_PER_M
     albedo = np.array([(m.color, m.second) for m in home.materials]).mean(axis=1) ** 2
     opaque = np.array([not m.glow for m in home.materials])
-    light = bake(quads, atlas.origin, atlas.right, atlas.down, size_m, faces, albedo, home.lamps, home.hidden, opaque)
-    textures = paint(atlas, home.hidden, home.materials, light)
+    style = home.style
+    if style.baked:
+        frame = atlas.origin, atlas.right, atlas.down
+        light = bake(quads, *frame, size_m, faces, albedo, home.lamps, home.hidden, opaque, style.directions)
+        light = light if style.key is None else light.exposed(albedo, style.key)
+    else:
+        light = LightMap.uniform(len(quads))
+    textures = paint(atlas, home.hidden, home.materials, light, style.exposure, style.shoulder)
     face_uv = atlas.uv[quad_of_face[:, None], corner]
     face_chart = atlas.chart[quad_of_face]
     vertices = home.quads.reshape(-1, 3)
@@ -94,7 +117,7 @@ def generate_home(name: str, rng: np.random.Generator) -> Scene:
         chart_instance=atlas.owner_images(home.owner),
         instances=home.instances,
         photograph=_photograph(atlas, vertices, faces, face_chart, textures),
-        unlit=True,
+        unlit=style.baked,
         double_sided=False,
     )
 

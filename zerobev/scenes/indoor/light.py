@@ -11,13 +11,12 @@ from embreex.rtcore_scene import EmbreeScene
 
 #: Side of a cell of the light map, metres.
 CELL_M = 0.14
-#: Directions per cell for the light of other surfaces.
-DIRECTIONS = 8
 #: Light weaker than this (1 is well lit) is ignored, without a shadow ray.
 FAINT = 0.02
 #: Uniform light in place of further reflections.
 AMBIENT = np.float32(0.02)
 _LIFT_M = 2e-3
+_LARGE_CELLS = 25
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,19 @@ class LightMap:
     shape: np.ndarray  #: (Q, 2) int: rows and columns of cells
     light: np.ndarray  #: (cells, 3) float32
 
+    @classmethod
+    def uniform(cls, quads: int) -> "LightMap":
+        """White light, one cell per quad."""
+        return cls(np.arange(quads + 1), np.ones((quads, 2), np.int64), np.ones((quads, 3), np.float32))
+
+    def exposed(self, albedo: np.ndarray, key: float) -> "LightMap":
+        """Scaled to a median brightness of `key` on large surfaces; albedo: (Q, 3) linear RGB."""
+        cells = self.shape.prod(axis=1)
+        large = np.repeat(cells >= _LARGE_CELLS, np.diff(self.start))
+        brightness = (self.light * np.repeat(albedo, np.diff(self.start), axis=0)).mean(axis=1)
+        factor = key / max(float(np.median(brightness[large])), 1e-4)
+        return LightMap(self.start, self.shape, self.light * np.float32(factor))
+
     def of(self, quad: int) -> np.ndarray:
         """(rows, columns, 3) of one quad."""
         return self.light[self.start[quad] : self.start[quad + 1]].reshape(*self.shape[quad], 3)
@@ -45,13 +57,14 @@ class LightMap:
 def bake(
     quads: np.ndarray, origin: np.ndarray, right: np.ndarray, down: np.ndarray, size_m: np.ndarray,
     faces: np.ndarray, albedo: np.ndarray, lamps: list[Lamp], hidden: np.ndarray,
-    opaque: np.ndarray,
+    opaque: np.ndarray, directions: int,
 ) -> LightMap:  # fmt: skip
     """Light on (Q, 4, 3) quads.
 
     origin, right, down: (Q, 3) frames of their rectangles; size_m: (Q, 2) height and width of those;
     faces: (F, 3) int32 triangles of the quads' corners; albedo: (Q, 3) linear RGB; hidden: (Q,) bool,
-    quads without light; opaque: (Q,) bool, quads that block light (lamp shades do not).
+    quads without light; opaque: (Q,) bool, quads that block light (lamp shades do not);
+    directions: rays per cell for the light of other surfaces.
     """
     shape = np.where(hidden[:, None], 1, np.maximum(np.ceil(size_m / CELL_M), 1)).astype(np.int64)
     count = np.where(hidden, 0, shape.prod(axis=1))
@@ -74,7 +87,8 @@ def bake(
     light = np.zeros((len(point), 3), np.float32)
     light[seen] = _direct(scene, point[seen], normal[seen].astype(np.float32), lamps)
     turn = (3 * (row % 3) + column % 3)[seen] * (2 * np.pi / 9)
-    other = _looked_at(scene, quad_of_face, point[seen], normal[seen], turn, start, shape, origin, right, down, step)
+    frame = start, shape, origin, right, down, step
+    other = _looked_at(scene, quad_of_face, point[seen], normal[seen], turn, directions, *frame)
     reflected = albedo.astype(np.float32)[quad]
     dark = np.zeros((1, 3), np.float32)
     bounced = np.zeros_like(light[seen])
@@ -117,10 +131,12 @@ def _direct(scene: EmbreeScene, point: np.ndarray, normal: np.ndarray, lamps: li
     return light
 
 
-def _looked_at(scene, quad_of_face, point, normal, turn, start, shape, origin, right, down, step) -> np.ndarray:
-    """(N, DIRECTIONS) cell visible from each point per direction, rotated by `turn` (N,); `start[-1]` for none."""
-    index = np.arange(DIRECTIONS) + 0.5
-    radius, angle = np.sqrt(index / DIRECTIONS), index * np.pi * (3 - np.sqrt(5))  # Vogel's spiral: cosine-weighted
+def _looked_at(
+    scene, quad_of_face, point, normal, turn, directions, start, shape, origin, right, down, step
+) -> np.ndarray:
+    """(N, directions) cell visible from each point per direction, rotated by `turn` (N,); `start[-1]` for none."""
+    index = np.arange(directions) + 0.5
+    radius, angle = np.sqrt(index / directions), index * np.pi * (3 - np.sqrt(5))  # Vogel's spiral: cosine-weighted
     helper = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
     a = np.cross(normal, helper)
     a /= np.linalg.norm(a, axis=1, keepdims=True)
@@ -130,7 +146,7 @@ def _looked_at(scene, quad_of_face, point, normal, turn, start, shape, origin, r
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
     ray = (np.stack([x, y, normal], axis=1).transpose(0, 2, 1) @ local.T).transpose(0, 2, 1)
     ray = np.ascontiguousarray(ray, np.float32).reshape(-1, 3)
-    source = np.repeat(point, DIRECTIONS, axis=0)
+    source = np.repeat(point, directions, axis=0)
     hit = scene.run(source, ray, query="INTERSECT", output=True)
     met = hit["primID"] >= 0
     quad = quad_of_face[hit["primID"][met]]
@@ -141,4 +157,4 @@ def _looked_at(scene, quad_of_face, point, normal, turn, start, shape, origin, r
     column = np.clip(column.astype(np.int64), 0, shape[quad, 1] - 1)
     other = np.full(len(source), start[-1], np.int64)
     other[met] = start[quad] + row * shape[quad, 1] + column
-    return other.reshape(-1, DIRECTIONS)
+    return other.reshape(-1, directions)

@@ -9,18 +9,19 @@ from zerobev.scenes.indoor.atlas import TEXELS_PER_M, Atlas
 from zerobev.scenes.indoor.light import LightMap
 from zerobev.scenes.indoor.solids import Material
 
-#: Tone mapping: light times `EXPOSURE`, with highlights compressed by `SHOULDER`.
-EXPOSURE, SHOULDER = np.float32(1.5), np.float32(0.9)
 
-
-def paint(atlas: Atlas, hidden: np.ndarray, materials: list[Material], light: LightMap) -> list[np.ndarray]:
+def paint(
+    atlas: Atlas, hidden: np.ndarray, materials: list[Material], light: LightMap, exposure: float, shoulder: float
+) -> list[np.ndarray]:
     """One (rows, columns, 3) uint8 sRGB image per chart.
+
+    Tone mapping: light times `exposure`, with highlights compressed by `shoulder`.
 
     Light is linear and colours are sRGB with a gamma of 2, so that colours are multiplied by the root of the light.
     Patterns are aligned to world coordinates, so that they continue across neighbouring quads of a plane.
     """
     planes = [np.zeros((3, *shape), np.uint8) for shape in atlas.shapes]
-    exposed = light.light.T * EXPOSURE / (1 + SHOULDER * light.light.T)
+    exposed = light.light.T * np.float32(exposure) / (1 + np.float32(shoulder) * light.light.T)
     root = np.sqrt(exposed) * np.float32(255)
     offset = np.stack(
         [np.einsum("qc,qc->q", atlas.origin, atlas.down), np.einsum("qc,qc->q", atlas.origin, atlas.right)], axis=1

@@ -13,6 +13,8 @@ import numpy as np
 _BOX = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7], [3, 2, 1, 0]])
 #: One letter per face of a box, in the same order: back, right, front, left, top, underside.
 _SIDES = "brfltu"
+#: Longest side of a quad, metres: it must fit a chart of the atlas. A longer box is several boxes.
+LONGEST_M = 10.2
 #: Undersides lower than this are below all cameras; they have no area in the atlas.
 _EYE_M = 0.85
 
@@ -63,6 +65,14 @@ class Solid:
         `hide` names invisible faces: (b)ack -y, (r)ight +x, (f)ront +y, (l)eft -x, (t)op, (u)nderside.
         """
         (x0, x1), (y0, y1), (z0, z1) = x, y, z
+        if x1 - x0 > LONGEST_M:
+            middle = (x0 + x1) / 2
+            self.box((x0, middle), y, z, material, hide=hide + "r")
+            return self.box((middle, x1), y, z, material, hide=hide + "l")
+        if y1 - y0 > LONGEST_M:
+            middle = (y0 + y1) / 2
+            self.box(x, (y0, middle), z, material, hide=hide + "f")
+            return self.box(x, (middle, y1), z, material, hide=hide + "b")
         mx, my = (x0 + x1) / 2 + lean[0], (y0 + y1) / 2 + lean[1]
         hx, hy = (x1 - x0) / 2 * taper, (y1 - y0) / 2 * taper
         lower = [(x0, y0, z0), (x1, y0, z0), (x1, y1, z0), (x0, y1, z0)]
@@ -129,6 +139,20 @@ class Solid:
         self._materials.extend(other._materials)
         return self
 
+    def uncovered(self) -> "Solid":
+        """A copy without hidden quads."""
+        solid = Solid()
+        solid._quads, solid._materials = self._quads, self._materials
+        solid._hidden = [np.zeros_like(hidden) for hidden in self._hidden]
+        return solid
+
+    def stretched(self, factor: np.ndarray) -> "Solid":
+        """A copy with each axis scaled by `factor` (3,) about the origin."""
+        solid = Solid()
+        solid._quads = [quads * factor for quads in self._quads]
+        solid._hidden, solid._materials = self._hidden, self._materials
+        return solid
+
     @property
     def filled(self) -> bool:
         """Whether it has a quad."""
@@ -160,3 +184,9 @@ def unseen(quads: np.ndarray) -> np.ndarray:
     """(Q,) bool: undersides among quads ((Q, 4, 3), metres) that are below all cameras."""
     normal = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
     return (normal[:, 2] < -0.99 * np.linalg.norm(normal, axis=1)) & (quads[:, :, 2].max(axis=1) < _EYE_M)
+
+
+def tops_above(quads: np.ndarray, height_m: float) -> np.ndarray:
+    """(Q,) bool: quads ((Q, 4, 3), metres) that face up, above a height."""
+    normal = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
+    return (normal[:, 2] > 0.99 * np.linalg.norm(normal, axis=1)) & (quads[:, :, 2].min(axis=1) > height_m)

@@ -9,7 +9,7 @@ from scipy import ndimage
 from zerobev.scenes.indoor.furniture.piece import Piece, Top
 from zerobev.scenes.indoor.light import Lamp
 from zerobev.scenes.indoor.plan import (
-    HEAD_M,
+    HALLS,
     Opening,
     Rectangle,
     Room,
@@ -20,6 +20,7 @@ from zerobev.scenes.indoor.plan import (
     side_frame,
 )
 from zerobev.scenes.indoor.solids import Solid
+from zerobev.scenes.indoor.style import FLATS, Style
 
 Design = Callable[[np.random.Generator], Piece]
 
@@ -31,6 +32,12 @@ _CELL_M = 0.05
 _DOOR_M = 0.75  # depth of the free floor in front of a door
 _FLAT_M = 0.06  # thinner pieces on walls do not block the way
 _TRIES = 40
+#: Names of pieces that may be anywhere in a room.
+_MOVABLE = frozenset((
+    "chair", "office chair", "bar chair", "armchair", "sofa", "stool", "ottoman", "bench", "bed", "table",
+    "coffee table", "side table", "console table", "desk", "plant", "basket", "trash can", "box", "toy", "ball",
+    "shoes", "cabinet", "chest of drawers", "bookshelf", "suitcase", "drying rack", "ironing board",
+))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,8 +60,8 @@ class Placed:
 class Space:
     """The contents of a room; refuses pieces that would block a door, a window or the way."""
 
-    def __init__(self, rng: np.random.Generator, room: Room) -> None:
-        self.rng, self.room = rng, room
+    def __init__(self, rng: np.random.Generator, room: Room, style: Style = FLATS) -> None:
+        self.rng, self.room, self.style = rng, room, style
         self.items: list = []
         self.lamps: list[Lamp] = []
         self.used_m2 = 0.0
@@ -69,7 +76,7 @@ class Space:
         self._door_cells = []
         for opening in room.openings:
             start, end = along(room, opening)
-            self._on_wall.append((opening.side, start - 0.1, end + 0.1, opening.sill, HEAD_M + 0.1))
+            self._on_wall.append((opening.side, start - 0.1, end + 0.1, opening.sill, opening.head + 0.1))
             if not opening.window:
                 self._rectangles.append(floor_before(room, opening.side, start, end, _DOOR_M))
                 if opening.leaf:
@@ -125,6 +132,20 @@ class Space:
             return None
         return left
 
+    # -- style ---------------------------------------------------------------------------------------------------
+
+    def _is_left_out(self) -> bool:
+        return self.style.kept < 1 and self.rng.random() > self.style.kept
+
+    def _stretched(self, piece: Piece) -> Piece:
+        """The piece in a size of this home; a piece up to the ceiling keeps its size."""
+        top, room = piece.bounds[1, 2], self.room.height - 0.04
+        if not self.style.stretch or top > room:
+            return piece
+        factor = np.exp(self.rng.uniform(-self.style.stretch, self.style.stretch, 3))
+        factor[2] = min(np.sqrt(factor[2]), room / top)
+        return piece.stretched(factor)
+
     # -- floor ---------------------------------------------------------------------------------------------------
 
     def put(self, placed: Placed, front: float = 0.0, z: float = 0.0) -> Placed | None:
@@ -149,7 +170,12 @@ class Space:
         self, piece: Piece, *, gap: float = 0.016, front: float = 0.3, sides: Sequence[int] = (0, 1, 2, 3),
         corner: bool = False, middle: bool = False, margin: float = 0.03,
     ) -> Placed | None:  # fmt: skip
-        """Place a piece with its back to a random wall, without covering a window."""
+        """Place a piece with its back to a random wall, without covering a window; a movable one perhaps elsewhere."""
+        if self._is_left_out():
+            return None
+        piece = self._stretched(piece)
+        if self.style.loose and piece.items[0][0] in _MOVABLE and self.rng.random() < self.style.loose:
+            return self._anywhere(piece.uncovered(), everywhere=True)
         (x0, _, _), (x1, _, _) = piece.bounds
         for _ in range(_TRIES):
             side = sides[int(self.rng.integers(len(sides)))]
@@ -168,9 +194,9 @@ class Space:
         return None
 
     def at_wall(self, piece: Piece, side: int, t: float, *, gap: float = 0.016, front: float = 0.0) -> Placed | None:
-        """Place a piece at position `t` of a wall, if it fits."""
+        """Place a piece at position `t` of a wall (-1: none), if it fits."""
         (x0, _, _), (x1, _, height) = piece.bounds
-        if not self._wall_is_free(side, t + x0, t + x1, 0.0, height):
+        if side < 0 or not self._wall_is_free(side, t + x0, t + x1, 0.0, height):
             return None
         x, y = self._at(side, t, gap)
         placed = self.put(Placed(piece, x, y, side_frame(self.room, side)[1], side, t), front)
@@ -178,13 +204,24 @@ class Space:
             self._on_wall.append((side, t + x0, t + x1, 0.0, float(height)))
         return placed
 
-    def in_the_open(self, piece: Piece, margin: float = 0.1) -> Placed | None:
-        """Place a piece anywhere, preferably near the middle of the room."""
+    def keep_free(self, placed: Placed) -> None:
+        """Reserve the floor in front of a piece at a wall."""
+        (x0, _, _), (x1, _, _) = placed.piece.bounds
+        start, end = placed.along + float(x0), placed.along + float(x1)
+        self._rectangles.append(floor_before(self.room, placed.side, start, end, _DOOR_M))
+
+    def in_the_open(self, piece: Piece, everywhere: bool = False) -> Placed | None:
+        """Place a piece anywhere, preferably near the middle of the room unless `everywhere`."""
+        return None if self._is_left_out() else self._anywhere(self._stretched(piece), everywhere)
+
+    def _anywhere(self, piece: Piece, everywhere: bool) -> Placed | None:
         x0, y0, x1, y1 = self.room.inner
         lower, upper = piece.bounds
         for attempt in range(_TRIES):
             yaw = float(self.rng.integers(4)) * np.pi / 2
-            spread = 0.1 + 0.8 * attempt / _TRIES
+            if self.style.askew and self.rng.random() < self.style.askew:
+                yaw += float(self.rng.uniform(-np.pi / 4, np.pi / 4))
+            spread = 0.95 if everywhere or self.room.kind in HALLS else 0.1 + 0.8 * attempt / _TRIES
             x = (x0 + x1) / 2 + self.rng.uniform(-0.5, 0.5) * spread * (x1 - x0)
             y = (y0 + y1) / 2 + self.rng.uniform(-0.5, 0.5) * spread * (y1 - y0)
             shift = Placed(piece, 0.0, 0.0, yaw).to_world(*((lower + upper)[:2] / 2))
@@ -209,7 +246,9 @@ class Space:
         )
 
     def on_wall(self, piece: Piece, z: float, side: int | None = None, t: float | None = None) -> Placed | None:
-        """Hang a piece on a wall with its z = 0 at height `z`, clear of openings and furniture."""
+        """Hang a piece on a wall (-1: none) with its z = 0 at height `z`, clear of openings and furniture."""
+        if side == -1 or self._is_left_out():
+            return None
         (x0, _, bottom), (x1, depth, top) = piece.bounds
         for _ in range(_TRIES if t is None else 1):
             wall = int(self.rng.integers(4)) if side is None else side
@@ -248,7 +287,9 @@ class Space:
         if placed is None or not placed.piece.tops:
             return done
         for _ in range(count):
-            piece = designs[int(self.rng.integers(len(designs)))](self.rng)
+            if self._is_left_out():
+                continue
+            piece = self._stretched(designs[int(self.rng.integers(len(designs)))](self.rng))
             top = placed.piece.tops[self.rng.integers(len(placed.piece.tops))]
             (x0, y0, _), (x1, y1, height) = piece.bounds
             if x1 - x0 > top.x[1] - top.x[0] or y1 - y0 > top.y[1] - top.y[0] or height > top.room:

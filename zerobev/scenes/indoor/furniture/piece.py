@@ -35,6 +35,19 @@ class Piece:
         """The piece at another pose, without its tops."""
         return Piece([(name, Solid().join(solid, (x, y, z), yaw)) for name, solid in self.items])
 
+    def uncovered(self) -> "Piece":
+        """The piece with its back visible."""
+        return Piece([(name, solid.uncovered()) for name, solid in self.items], self.tops)
+
+    def stretched(self, factor: np.ndarray) -> "Piece":
+        """The piece with each axis scaled by `factor` (3,) about its origin."""
+        x, y, z = factor.tolist()
+        tops = [
+            Top((x * top.x[0], x * top.x[1]), (y * top.y[0], y * top.y[1]), z * top.z, z * top.room)
+            for top in self.tops
+        ]
+        return Piece([(name, solid.stretched(factor)) for name, solid in self.items], tops)
+
 
 def one(name: str, solid: Solid, *tops: Top) -> Piece:
     """A piece of one instance."""
