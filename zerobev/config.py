@@ -5,7 +5,7 @@ batch of 16, ...) are the paper's.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from zerobev.common.errors import InputError
@@ -67,6 +67,15 @@ class CameraConfig:
     def focal_px(self) -> float:
         """Focal length of the FPV image, pixels."""
         return 0.5 * self.fpv_px / math.tan(math.radians(self.hfov_deg) / 2)
+
+    def at_height(self, height_m: float) -> "CameraConfig":
+        """The camera for images from another height, stretched vertically to this camera's floor.
+
+        In such an image the floor is at this camera's rows. Heights above the floor appear scaled by the ratio of the
+        two camera heights, and so do the limits on them.
+        """
+        factor = self.height_m / height_m
+        return replace(self, max_height_m=factor * self.max_height_m, obstacle_m=factor * self.obstacle_m)
 
     @property
     def cell_m(self) -> float:

@@ -41,16 +41,19 @@ class ZeroBEV(BevModel):
                 self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
+    def forward(
+        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
+    ) -> MapLogits:
         """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
-        depth: (B, 1, H, W) metres, true or estimated; used only in the residual variant
+        depth: (B, 1, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
+        height_m: (B,) of the cameras, for the limit on heights of P^-1; default: `camera.height_m`
         """
         self.check_inputs(rgb, zero, depth)
         images = [zero]
         if self.config.residual:
             assert depth is not None  # as checked
-            images.append(inverse_project(zero, depth, self.camera))
+            images.append(inverse_project(zero, depth, self.camera, height_m))
         laterals = self.rgb_laterals(rgb)
         parts = zip(*(image.split(max(1, IMAGES_PER_PASS // len(zero)), dim=1) for image in images))
         logits = torch.cat([self.pass_images(laterals, *part) for part in parts], dim=1)  # B K 1+aux M M

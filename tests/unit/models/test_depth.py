@@ -32,6 +32,7 @@ from zerobev.common.errors import InputError
 from zerobev.config import SCALES, TrainConfig
 from zerobev.data.samples import ViewSet, as_float
 from zerobev.data.views import View
+from zerobev.geometry.cameras import Camera
 from zerobev.inference import Projector
 from zerobev.inference.pinhole import PinholeView
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
@@ -382,7 +383,7 @@ def test_a_projector_resamples_the_photograph_to_the_size_of_the_model():
     photograph = np.random.default_rng(0).random((500, 500, 3))
     depth = Projector("a.2", SMOKE.camera, None, estimator.eval()).depth(photograph)
     assert depth.shape == (32, 32)
-    expected = torch.from_numpy(PinholeView((500, 500), 79, fine).photograph(photograph)).permute(2, 0, 1)
+    expected = torch.from_numpy(PinholeView((500, 500), Camera(), fine).photograph(photograph)).permute(2, 0, 1)
     torch.testing.assert_close(seen[0][0] * estimator.std + estimator.mean, expected)
 
 
