@@ -1,0 +1,42 @@
+"""Depth as a depth camera would measure it: limited range, noise, steps, holes and misalignment."""
+
+import numpy as np
+
+#: Range of values, metres.
+NEAR_M, FAR_M = 0.3, 6.0
+# A stereo or structured-light camera measures 1 / z: noise and step in 1 / metres give errors that grow with z^2
+_NOISE, _STEP = 0.0015, 0.0025
+_EDGE = 0.08  # relative step of depth to a neighbour at which a value is lost
+_LOST_AT_EDGES = 0.5  # fraction of values lost there
+_BLACK, _BRIGHT = 0.06, 0.97  # brightness below and above which a surface gives no value (black, or glass)
+_LOST_IF_DARK = 0.7  # fraction of values lost at such surfaces
+_HOLES = 3  # mean number of further holes per image
+
+
+def sensor_depth(depth: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A measurement of true depth.
+
+    depth: (H, W) planar depth, metres, 0 for no surface
+    rgb: (H, W, 3) uint8 photograph
+    Returns (H, W) float32, metres, 0 for no value.
+    """
+    side = depth.shape
+    # the photograph and the depth image are a pixel apart at most
+    measured = np.roll(depth, tuple(rng.integers(-1, 2, 2)), axis=(0, 1)).astype(np.float64)
+    known = (measured > NEAR_M) & (measured < FAR_M)
+    inverse = 1 / np.where(known, measured, 1.0) + rng.normal(0, _NOISE, side)
+    measured = 1 / np.maximum(np.rint(inverse / _STEP) * _STEP, 1 / FAR_M)
+    brightness = rgb.mean(axis=2) / 255
+    known &= ~(((brightness < _BLACK) | (brightness > _BRIGHT)) & (rng.random(side) < _LOST_IF_DARK))
+    steps = [np.abs(np.diff(measured, axis=axis, prepend=measured.take([0], axis=axis))) for axis in (0, 1)]
+    known &= ~((np.maximum(*steps) > _EDGE * measured) & (rng.random(side) < _LOST_AT_EDGES))
+    for _ in range(rng.poisson(_HOLES)):
+        known &= ~_ellipse(side, rng)
+    return np.where(known, measured, 0).astype(np.float32)
+
+
+def _ellipse(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """(H, W) bool: an ellipse at a random place, with half axes of 2 to 15 % of the image."""
+    row, column = np.ogrid[: shape[0], : shape[1]]
+    centre, half = rng.random(2) * shape, rng.uniform(0.02, 0.15, 2) * shape
+    return ((row - centre[0]) / half[0]) ** 2 + ((column - centre[1]) / half[1]) ** 2 < 1
