@@ -22,7 +22,8 @@ def sensor_depth(depth: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -
     """
     side = depth.shape
     # the photograph and the depth image are a pixel apart at most
-    measured = np.roll(depth, tuple(rng.integers(-1, 2, 2)), axis=(0, 1)).astype(np.float64)
+    top, left = rng.integers(0, 3, 2)
+    measured = np.pad(depth.astype(np.float64), 1)[top : top + side[0], left : left + side[1]]
     known = (measured > NEAR_M) & (measured < FAR_M)
     inverse = 1 / np.where(known, measured, 1.0) + rng.normal(0, _NOISE, side)
     measured = 1 / np.maximum(np.rint(inverse / _STEP) * _STEP, 1 / FAR_M)
