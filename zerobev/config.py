@@ -13,8 +13,8 @@ from zerobev.common.errors import InputError
 Split = Literal["train", "validation", "test"]
 #: Training data of the zero-shot stream; "classes" is not zero-shot (paper, Table 5 and Section 4).
 Stream = Literal["synth", "modsem", "depthproj", "classes"]
-#: Depth input of a method.
-Depth = Literal["true", "estimated"]
+#: Depth input of a method; "mixed", in training alone, is of any quality, see `data.sensor_depth.mixed_depth`.
+Depth = Literal["true", "estimated", "mixed"]
 #: Residual block of the RGB backbone.
 Block = Literal["basic", "bottleneck"]
 
@@ -116,6 +116,15 @@ class TextureConfig:
 
 
 @dataclass(frozen=True)
+class AugmentConfig:
+    """Random changes of training samples (not in the paper); fractions of the samples."""
+
+    looks: float = 0.0  #: with another look of the photograph, see `data.looks`
+    cameras: float = 0.0  #: as seen by a tilted camera, or one with another field of view, see `data.cameras`
+    mirrored: float = 0.0  #: mirrored left to right
+
+
+@dataclass(frozen=True)
 class SceneConfig:
     """Number of scenes per split, number of views per scene, and the seed of both."""
 
@@ -124,6 +133,8 @@ class SceneConfig:
     test: int
     views: int  #: per scene
     seed: int = 0
+    #: range of the camera's height above the floor, drawn per view; None: that of `CameraConfig`
+    heights_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -151,6 +162,8 @@ class ModelConfig:
     band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)  #: depths between bands
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
+    seen: bool = False  #: beside that, which cells P^-1 sees at all
+    floor_depth: bool = False  #: estimated depth is at most that of the floor
     segmentation: bool = False  #: masks of the eight classes as input (TIM, row (b.3))
 
 
@@ -190,6 +203,8 @@ class Scale:
     texture: TextureConfig = field(default_factory=TextureConfig)
     empty_fraction: float = 0.0  #: fraction of empty samples (not in the paper)
     extruded_fraction: float = 0.0  #: fraction of *Synth* samples with extruded textures (not in the paper)
+    objects_fraction: float = 0.0  #: fraction of *Synth* samples with whole instances in white (not in the paper)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
     test_views: int | None = None  #: networks are evaluated on the first so many of each test scene; None: all
     #: initial weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
     backbone: str = ""

@@ -1,4 +1,4 @@
-"""Depth as a depth camera would measure it: limited range, noise, steps, holes and misalignment."""
+"""Depth as a depth camera would measure it: limited range, noise, steps, holes and misalignment; and its completion."""
 
 import numpy as np
 
@@ -11,6 +11,7 @@ _LOST_AT_EDGES = 0.5  # fraction of values lost there
 _BLACK, _BRIGHT = 0.06, 0.97  # brightness below and above which a surface gives no value (black, or glass)
 _LOST_IF_DARK = 0.7  # fraction of values lost at such surfaces
 _HOLES = 3  # mean number of further holes per image
+_MIN_KNOWN = 64  # pixels with a value from which the scale of an estimate is taken
 
 
 def sensor_depth(depth: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -34,6 +35,33 @@ def sensor_depth(depth: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -
     for _ in range(rng.poisson(_HOLES)):
         known &= ~_ellipse(side, rng)
     return np.where(known, measured, 0).astype(np.float32)
+
+
+def completed(known: np.ndarray, estimated: np.ndarray) -> np.ndarray:
+    """Known depth, with the estimate where it is 0: (H, W) float32, metres.
+
+    The estimate is scaled by the median ratio of known to estimated depth, so that both agree where they meet.
+    """
+    valid = known > 0
+    if valid.sum() >= _MIN_KNOWN:
+        estimated = estimated * np.median(known[valid] / np.maximum(estimated[valid], 1e-3))
+    return np.where(valid, known, estimated).astype(np.float32)
+
+
+def mixed_depth(depth: np.ndarray, estimated: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Depth of a random quality, (H, W) float32, metres: true, measured, estimated, or missing, in part or wholly.
+
+    Measured depth is completed by the estimate in half of the samples; otherwise its holes stay 0.
+    """
+    kind = rng.integers(5)
+    if kind == 0:
+        return depth.astype(np.float32)
+    if kind == 1:
+        return estimated.astype(np.float32)
+    if kind == 2:
+        return np.zeros(depth.shape, np.float32)
+    measured = sensor_depth(depth, rgb, rng)
+    return completed(measured, estimated) if kind == 3 else measured
 
 
 def _ellipse(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

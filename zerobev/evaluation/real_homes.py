@@ -26,12 +26,11 @@ from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.data.samples import as_float, class_masks, collate, view_sample
-from zerobev.data.sensor_depth import sensor_depth
+from zerobev.data.sensor_depth import completed, sensor_depth
 from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
 from zerobev.geometry.projection import inverse_project
-from zerobev.inference.measured_depth import completed
 from zerobev.inference.projector import GEOMETRIC, Projector, load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 from zerobev.models.variants import VARIANTS
@@ -193,12 +192,9 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
     batch = render_views(folder, views, camera, seed)
     with torch.inference_mode():
         estimated = projectors[ROWS[0]].estimator(batch["rgb"])
-    pairs = zip(batch["sensor"].split(1), estimated.split(1))
-    depths = {
-        "": estimated,
-        ".true": batch["depth"],
-        ".sensor": torch.cat([completed(*pair) for pair in pairs]),
-    }
+    pairs = zip(batch["sensor"].numpy(), estimated.numpy())
+    measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
+    depths = {"": estimated, ".true": batch["depth"], ".sensor": measured}
     maps = {
         ORACLE: inverse_project(batch["zero"], batch["depth"], camera) > 0,
         GEOMETRIC: inverse_project(batch["zero"], estimated, camera) > 0,

@@ -65,7 +65,7 @@ def _estimated(wanted: Run) -> list[Split]:
         return []
     stages = wanted.experiment.stages
     depths = {"train": stages, "validation": stages[-1:], "test": (wanted.experiment.test_depth,)}
-    return [split for split in SPLITS if "estimated" in depths[split]]
+    return [split for split in SPLITS if {"estimated", "mixed"} & set(depths[split])]
 
 
 def _one_at_a_time(workspace: Workspace) -> FileLock:

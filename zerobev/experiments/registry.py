@@ -84,6 +84,8 @@ def _experiments() -> dict[str, Experiment]:
         Experiment("e", "e"),
         Experiment("f", "f"),
         Experiment("f.r", "f.r", train_depth=stages),
+        # not in the paper: depth of any quality, or none
+        Experiment("d.any", "d", train_depth=("mixed",)),
         # Table 3
         Experiment("d.gt", "d"),
         Experiment("d.predicted", "d", train_depth=("estimated",)),

@@ -15,6 +15,7 @@ import torch
 from zerobev.common.keys import plain
 from zerobev.config import LABELS, CameraConfig, Depth, Split, one_of
 from zerobev.data.samples import (
+    Augment,
     DepthProjSamples,
     ModSemSamples,
     SemanticPass,
@@ -71,7 +72,9 @@ class Run:
             config |= {"model": wanted.model(scale), "backbone": self.backbone, "train": scale.train}
             config |= {"texture": workspace.texture_config(wanted.texture(scale))}
             config |= {"empty_fraction": wanted.empty_fraction(scale)}
-            config |= {"extruded_fraction": wanted.extruded_fraction(scale)}
+            config |= {"extruded_fraction": wanted.extruded_fraction(scale), "augment": scale.augment}
+            if scale.objects_fraction and wanted.stream == "synth":
+                config |= {"objects_fraction": scale.objects_fraction}
         return config
 
     @cached_property
@@ -191,17 +194,22 @@ class Run:
         """Training samples of a split."""
         wanted, workspace, scale = self.experiment, self.workspace, self.workspace.scale
         views = self.views(split, depth)
-        common = (scale.camera, seed, scale.train.batch, wanted.empty_fraction(scale))
+        augment = workspace.augmentation if split == "train" else None
+        common = (scale.camera, seed, scale.train.batch, wanted.empty_fraction(scale), augment)
         if wanted.stream == "synth":
             bank = workspace.bank(wanted.texture(scale))
-            return SynthSamples(views, bank, *common, wanted.fresh, wanted.extruded_fraction(scale))
-        kinds: dict[str, Callable[[ViewSet, CameraConfig, int, int, float], Source]]
+            return SynthSamples(
+                views, bank, *common, wanted.fresh, wanted.extruded_fraction(scale), scale.objects_fraction
+            )
+        kinds: dict[str, Callable[[ViewSet, CameraConfig, int, int, float, Augment | None], Source]]
         kinds = {"modsem": ModSemSamples, "depthproj": DepthProjSamples, "classes": SemanticSamples}
         return kinds[wanted.stream](views, *common)
 
     def views(self, split: Split, depth: Depth) -> ViewSet:
-        """The views of a split with true or estimated depth."""
+        """The views of a split with true or estimated depth, or with both, to be mixed."""
         one_of("depth", depth, Depth)
+        if depth == "mixed":
+            return self.pretraining.mixed_views(split)
         return self.workspace.views(split) if depth == "true" else self.pretraining.views(split)
 
 

@@ -84,15 +84,18 @@ _MIN_HFOV_DEG = 1e-6  # smaller angles overflow, and cover no pixel in any case
 
 @dataclass(frozen=True)
 class Pose:
-    """Position of the camera on the floor (world frame, metres), and its heading.
+    """Position of the camera on the floor (world frame, metres), its heading, and its height.
 
     yaw: angle of the forward direction from world +x, counter-clockwise, radians
+    height_m: of the pinhole above the floor; None: that of the `CameraConfig`. Images from another height are stretched
+        vertically to the floor of `CameraConfig`, see `CameraConfig.at_height`
     """
 
     x: float
     y: float
     floor_z: float
     yaw: float
+    height_m: float | None = None
 
     @property
     def world_R_map(self) -> np.ndarray:
@@ -108,7 +111,11 @@ class Pose:
 
     def centre(self, camera: CameraConfig) -> np.ndarray:
         """(3,) float64: the pinhole in the world frame."""
-        return np.array([self.x, self.y, self.floor_z + camera.height_m])
+        return np.array([self.x, self.y, self.floor_z + (self.height_m or camera.height_m)])
+
+    def stretch(self, camera: CameraConfig) -> float:
+        """Height of the pinhole over that of `camera`: the factor on the vertical slopes of an image's rays."""
+        return 1.0 if self.height_m is None else self.height_m / camera.height_m
 
 
 def fpv_rays(camera: CameraConfig) -> np.ndarray:

@@ -1,14 +1,12 @@
-"""Depth of a sensor: its checks, and its completion by estimated depth."""
+"""Checks of depth from a sensor."""
 
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from zerobev.common.errors import InputError
 
 MAX_MEDIAN_M = 200.0  #: larger median depths are probably in millimetres
-_MIN_KNOWN = 64  # pixels with a value from which the estimate's scale is taken
 
 
 def checked_depth(depth: Any, shape: tuple[int, int]) -> np.ndarray:
@@ -30,15 +28,3 @@ def checked_depth(depth: Any, shape: tuple[int, int]) -> np.ndarray:
     if len(known) and (median := float(np.median(known))) > MAX_MEDIAN_M:
         raise InputError(f"depth: expected metres, found a median of {median:g}: millimetres?")
     return values
-
-
-def completed(known: Tensor, estimated: Tensor) -> Tensor:
-    """Known depth, with the estimate where it is 0.
-
-    The estimate is scaled by the median ratio of known to estimated depth, so that both agree where they meet.
-    known, estimated: (1, 1, S, S) metres
-    """
-    valid = known > 0
-    if int(valid.sum()) >= _MIN_KNOWN:
-        estimated = estimated * (known[valid] / estimated[valid].clamp(min=1e-3)).median()
-    return known.where(valid, estimated)

@@ -11,12 +11,13 @@ from torch import Tensor, nn
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
+from zerobev.data.sensor_depth import completed
 from zerobev.geometry.cameras import Camera
 from zerobev.geometry.projection import fov_mask, inverse_project
 from zerobev.inference.arrays import checked_image
 from zerobev.inference.bev_map import BevArrows, BevMap
 from zerobev.inference.flow import Flow
-from zerobev.inference.measured_depth import MAX_MEDIAN_M, checked_depth, completed
+from zerobev.inference.measured_depth import MAX_MEDIAN_M, checked_depth
 from zerobev.inference.modality import BinaryImages, Modality, Names
 from zerobev.inference.pinhole import PinholeView
 from zerobev.inference.plain_arrays import kind_of
@@ -114,12 +115,13 @@ class Projector:
 
     def _depth(self, photograph: np.ndarray, source: Camera, view: PinholeView, measured: np.ndarray | None) -> Tensor:
         """(1, 1, S, S) metres: measured, and estimated where no value was measured."""
-        known = None if measured is None else torch.from_numpy(view.depth(measured))[None, None]
         covered = torch.from_numpy(view.covered)
-        if known is not None and bool((known > 0)[..., covered].all()):
-            return known * covered
-        estimated = self._estimated(photograph, source, view)
-        return (estimated if known is None else completed(known, estimated)) * covered
+        if measured is None:
+            return self._estimated(photograph, source, view) * covered
+        known = view.depth(measured)
+        if not (known > 0)[view.covered].all():
+            known = completed(known, self._estimated(photograph, source, view)[0, 0].numpy())
+        return torch.from_numpy(known)[None, None] * covered
 
     def _estimated(self, photograph: np.ndarray, source: Camera, view: PinholeView) -> Tensor:
         """(1, 1, S, S) metres; the estimator's input has its `side_px`, if it has one."""
