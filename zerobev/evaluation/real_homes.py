@@ -195,9 +195,10 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
     pairs = zip(batch["sensor"].numpy(), estimated.numpy())
     measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
     depths = {"": estimated, ".true": batch["depth"], ".sensor": measured}
+    heights = batch.get("height")
     maps = {
-        ORACLE: inverse_project(batch["zero"], batch["depth"], camera) > 0,
-        GEOMETRIC: inverse_project(batch["zero"], estimated, camera) > 0,
+        ORACLE: inverse_project(batch["zero"], batch["depth"], camera, heights) > 0,
+        GEOMETRIC: inverse_project(batch["zero"], estimated, camera, heights) > 0,
         CONSTANT: torch.zeros_like(batch["target"], dtype=torch.bool),
     }
     maps[CONSTANT][:, _FLOOR] = True
@@ -205,7 +206,7 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
         for row, projector in projectors.items():
             assert projector.network is not None  # as all shipped rows
             for suffix, depth in depths.items() if row in _RESIDUAL else (("", estimated),):
-                maps[row + suffix] = projector.network(batch["rgb"], batch["zero"], depth).zero_logits > 0
+                maps[row + suffix] = projector.network(batch["rgb"], batch["zero"], depth, heights).zero_logits > 0
     counts = {row: evaluate(partial(_given, maps[row]), [batch], 1, len(LABELS)) for row in METHODS}
     return HomeResult(counts, _depth_report(batch, estimated))
 

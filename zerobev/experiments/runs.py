@@ -75,6 +75,8 @@ class Run:
             config |= {"extruded_fraction": wanted.extruded_fraction(scale), "augment": scale.augment}
             if scale.objects_fraction and wanted.stream == "synth":
                 config |= {"objects_fraction": scale.objects_fraction}
+            if scale.mixed_depth and wanted.reads_depth:
+                config |= {"mixed_depth": True}
         return config
 
     @cached_property
@@ -171,8 +173,8 @@ class Run:
         torch.manual_seed(self.seed)
         model = build(wanted.network, scale.camera, wanted.model(scale))
         load_backbone(model.backbone, self.backbone or self.pretraining.weights)
-        data = InTurn([self.source("train", depth, self.seed) for depth in wanted.stages], config.steps)
-        held_out = self.source("validation", wanted.stages[-1], seed=0)
+        data = InTurn([self.source("train", depth, self.seed) for depth in wanted.stages(scale)], config.steps)
+        held_out = self.source("validation", wanted.stages(scale)[-1], seed=0)
         validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]
         objective = dice_objective(config.alpha, model.config.aux)
         history = train(
@@ -241,4 +243,4 @@ class InTurn:
 
 def _projection(camera: CameraConfig) -> Predictor:
     """P^-1 with the depth of the batch, rows (a)."""
-    return lambda batch: inverse_project(batch["zero"], batch["depth"], camera) > 0
+    return lambda batch: inverse_project(batch["zero"], batch["depth"], camera, batch.get("height")) > 0

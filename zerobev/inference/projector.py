@@ -165,10 +165,10 @@ class Projector:
 
     def predict(self, batch: Mapping[str, Tensor]) -> Tensor:
         """A batch of `data.samples` -> maps (B, K, M, M) bool, for `evaluation.evaluate`; with estimated depth."""
-        depth = self.estimator(batch["rgb"])
+        depth, heights = self.estimator(batch["rgb"]), batch.get("height")
         if self.network is None:
-            return inverse_project(batch["zero"], depth, self.camera) > 0.5
-        return self.network(batch["rgb"], batch["zero"], depth).zero_logits > 0
+            return inverse_project(batch["zero"], depth, self.camera, heights) > 0.5
+        return self.network(batch["rgb"], batch["zero"], depth, heights).zero_logits > 0
 
 
 def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None) -> Projector:
