@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
-    from zerobev.inference import BevArrows, BevMap, Boxes, Flow, Labels, Masks, Probabilities, Projector, load
+    from zerobev.inference import BevArrows, BevMap, Boxes, Camera, Flow, Labels, Masks, Probabilities, Projector, load
 
 __version__ = "0.2.0.dev0"
 
-__all__ = ["BevArrows", "BevMap", "Boxes", "Flow", "Labels", "Masks", "Probabilities", "Projector", "load"]
+__all__ = ["BevArrows", "BevMap", "Boxes", "Camera", "Flow", "Labels", "Masks", "Probabilities", "Projector", "load"]
 
 
 def __getattr__(name: str) -> Any:

@@ -5,7 +5,7 @@ batch of 16, ...) are the paper's.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from zerobev.common.errors import InputError
@@ -13,8 +13,8 @@ from zerobev.common.errors import InputError
 Split = Literal["train", "validation", "test"]
 #: Training data of the zero-shot stream; "classes" is not zero-shot (paper, Table 5 and Section 4).
 Stream = Literal["synth", "modsem", "depthproj", "classes"]
-#: Depth input of a method.
-Depth = Literal["true", "estimated"]
+#: Depth input of a method; "mixed", in training alone, is of any quality, see `data.sensor_depth.mixed_depth`.
+Depth = Literal["true", "estimated", "mixed"]
 #: Generated homes: flats like each other, or a mixture of buildings, styles and light.
 Homes = Literal["flats", "varied"]
 #: Residual block of the RGB backbone.
@@ -70,6 +70,15 @@ class CameraConfig:
         """Focal length of the FPV image, pixels."""
         return 0.5 * self.fpv_px / math.tan(math.radians(self.hfov_deg) / 2)
 
+    def at_height(self, height_m: float) -> "CameraConfig":
+        """The camera for images from another height, stretched vertically to this camera's floor.
+
+        In such an image the floor is at this camera's rows. Heights above the floor appear scaled by the ratio of the
+        two camera heights, and so do the limits on them.
+        """
+        factor = self.height_m / height_m
+        return replace(self, max_height_m=factor * self.max_height_m, obstacle_m=factor * self.obstacle_m)
+
     @property
     def cell_m(self) -> float:
         """Side of a map cell, metres."""
@@ -109,6 +118,15 @@ class TextureConfig:
 
 
 @dataclass(frozen=True)
+class AugmentConfig:
+    """Random changes of training samples (not in the paper); fractions of the samples."""
+
+    looks: float = 0.0  #: with another look of the photograph, see `data.looks`
+    cameras: float = 0.0  #: as seen by a tilted camera, or one with another field of view, see `data.cameras`
+    mirrored: float = 0.0  #: mirrored left to right
+
+
+@dataclass(frozen=True)
 class SceneConfig:
     """Number of scenes per split, number of views per scene, and the seed of both."""
 
@@ -118,6 +136,8 @@ class SceneConfig:
     views: int  #: per scene
     seed: int = 0
     homes: Homes = "flats"  #: kind of generated homes
+    #: range of the camera's height above the floor, drawn per view; None: that of `CameraConfig`
+    heights_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         one_of("homes", self.homes, Homes)
@@ -148,6 +168,8 @@ class ModelConfig:
     band_edges_m: tuple[float, ...] = (0.0, 0.8, 2.0, 3.8, 5.0)  #: depths between bands
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
+    seen: bool = False  #: beside that, which cells P^-1 sees at all
+    floor_depth: bool = False  #: estimated depth is at most that of the floor
     segmentation: bool = False  #: masks of the eight classes as input (TIM, row (b.3))
 
 
@@ -187,6 +209,9 @@ class Scale:
     texture: TextureConfig = field(default_factory=TextureConfig)
     empty_fraction: float = 0.0  #: fraction of empty samples (not in the paper)
     extruded_fraction: float = 0.0  #: fraction of *Synth* samples with extruded textures (not in the paper)
+    objects_fraction: float = 0.0  #: fraction of *Synth* samples with whole instances in white (not in the paper)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    mixed_depth: bool = False  #: residual networks are trained with depth of any quality (not in the paper)
     test_views: int | None = None  #: networks are evaluated on the first so many of each test scene; None: all
     #: initial weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
     backbone: str = ""

@@ -1,6 +1,7 @@
 """The shipped weights on a folder of homes: against recorded shards of the same views, and as a command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,13 @@ from zerobev.data.samples import ViewSet, semantic_batches
 from zerobev.data.shards import Shard
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.evaluation.metrics import Counts
-from zerobev.evaluation.real_homes import METHODS, evaluate_homes
+from zerobev.evaluation.real_homes import METHODS, DepthReport, Results, evaluate_homes, render_views
 from zerobev.geometry.projection import inverse_project
+from zerobev.inference.projector import load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 from zerobev.models import load_model
 from zerobev.scenes.hm3dsem_writer import write_scene
+from zerobev.scenes.readers import list_scenes
 
 from support.paths import REAL_HOMES
 from support.scenes import build, furnished
@@ -36,10 +39,17 @@ def homes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def counts(homes: Path) -> dict[str, Counts]:
-    found, broken = evaluate_homes([homes / "val/00001-HomeA", homes / "train/00002-HomeB"], views=3, seed=5)
-    assert not broken
+def results(homes: Path) -> Results:
+    lines: list[str] = []
+    found = evaluate_homes([homes / "val/00001-HomeA", homes / "train/00002-HomeB"], 3, seed=5, report=lines.append)
+    assert not found.broken
+    assert [line.split(":")[0] for line in lines] == ["[1/2] 00001-HomeA", "[2/2] 00002-HomeB"]
     return found
+
+
+@pytest.fixture(scope="module")
+def counts(results: Results) -> dict[str, Counts]:
+    return results.counts
 
 
 def test_counts_are_those_of_recorded_shards(homes, counts, tmp_path):
@@ -59,11 +69,30 @@ def test_counts_are_those_of_recorded_shards(homes, counts, tmp_path):
 
 
 def test_every_row_is_another_method(counts):
-    assert list(counts) == list(METHODS) == ["a.1", "a.2", *ROWS]
+    assert list(counts) == list(METHODS) == ["a.1", "a.2", "c", "d", "d.sensor", "d.true", "constant"]
     unions = [tuple(one.union.ravel()) for one in counts.values()]
     assert len(set(unions)) == len(unions)
     # true depth knows the visible floor; estimated depth on coloured boxes does not
     assert counts["a.1"].pixel_iou() > counts["a.2"].pixel_iou()
+    assert counts["d.true"].pixel_iou() > counts["d.sensor"].pixel_iou() > counts["d"].pixel_iou()
+    constant = counts["constant"].iou_per_class()
+    assert constant[LABELS.index("floor")] > 0 and np.nansum(constant) == constant[LABELS.index("floor")]
+
+
+def test_depth_errors_and_reasons(homes, results):
+    """Against the estimator itself on the same views; an estimate of half the floor's distance is named as reason."""
+    batch = render_views(homes / "val/00001-HomeA", 3, load("a.2").camera, 5)
+    estimated = load("a.2").estimator(batch["rgb"]).detach()
+    known, report = batch["depth"] > 0, results.homes["00001-HomeA"].depth
+    error = ((estimated - batch["depth"]).abs() / batch["depth"])[known].mean()
+    assert report.relative == pytest.approx(float(error), rel=1e-4)
+    floor = known & (batch["zero"][:, [LABELS.index("floor")]] > 0)
+    assert report.floor_ratio == pytest.approx(float((estimated / batch["depth"])[floor].median()), rel=1e-4)
+    good = DepthReport(relative=0.1, mad_m=0.2, floor_ratio=1.0, brightness=0.5, median_m=2.0)
+    assert good.reasons() == "depth is right here: the map is what fails"
+    assert "puts the floor at 0.50 of its distance" in replace(good, floor_ratio=0.5, relative=0.5).reasons()
+    assert "35% off, on walls and objects" in replace(good, relative=0.35).reasons()
+    assert "dark" in replace(good, brightness=0.1).reasons() and "near" in replace(good, median_m=1.0).reasons()
 
 
 def test_the_command_takes_every_home_and_skips_broken_ones_loudly(homes, tmp_path, capsys):
@@ -79,13 +108,24 @@ def test_the_command_takes_every_home_and_skips_broken_ones_loudly(homes, tmp_pa
         cli.main(
             ["evaluate", "--scenes", str(tmp_path / "some"), "--views", "1", "--json", str(tmp_path / "found.json")]
         )
-    assert "2 homes, 1 views each" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "2 homes, 1 views each" in shown and "[3/3] 00003-HomeC: skipped" in shown
+    assert shown.count("has ") == 2  # both homes are discussed
     found = json.loads((tmp_path / "found.json").read_text())
     assert found["scenes"] == ["00001-HomeA", "00002-HomeB"] and set(found["rows"]) == set(METHODS)
+    assert set(found["depth"]["by_home"]) == set(found["scenes"]) and found["depth"]["relative"] > 0
     for row, entry in found["rows"].items():
         counts = Counts.from_json(entry)
         assert counts.union.shape == (2, 8) and entry["class_iou"] == counts.class_iou()
-        assert entry["weights"] == (run_of(shipped(row)) if row in ROWS else None)
+        weights = row.split(".")[0]
+        assert entry["weights"] == (run_of(shipped(weights)) if weights in ROWS else None)
+
+
+def test_a_data_set_a_part_of_it_or_a_scene_are_accepted(homes, tmp_path):
+    a, b = homes / "val/00001-HomeA", homes / "train/00002-HomeB"
+    assert list_scenes(homes) == [a, b] and list_scenes(homes / "val") == [a] and list_scenes(b) == [b]
+    with pytest.raises(InputError, match="expected train, val or minival"):
+        list_scenes(tmp_path)
 
 
 def test_nothing_to_evaluate_is_refused(homes):
@@ -98,6 +138,6 @@ def test_real_homes():
     if not folder.is_dir():
         pytest.skip(f"no development homes at {REAL_HOMES}")
     torch.set_num_threads(1)
-    counts, broken = evaluate_homes([folder], views=4)
+    found = evaluate_homes([folder], views=4)
     floor = LABELS.index("floor")
-    assert not broken and all(one.iou_per_class()[floor] > 0.2 for one in counts.values())
+    assert not found.broken and all(one.iou_per_class()[floor] > 0.2 for one in found.counts.values())

@@ -30,6 +30,9 @@ from zerobev.scenes.readers import read_scene, split_scenes
 
 _MANIFEST = "manifest.json"
 
+#: Range of the cameras' heights, see `ViewSource`.
+Heights = tuple[float, float] | None
+
 
 def shard_path(scene_folder: Path, out: Path) -> Path:
     """The path of a scene's shard."""
@@ -37,7 +40,13 @@ def shard_path(scene_folder: Path, out: Path) -> Path:
 
 
 def generate_shard(
-    scene_folder: Path, out: Path, views: int, camera: CameraConfig, texture: TextureConfig, seed: int
+    scene_folder: Path,
+    out: Path,
+    views: int,
+    camera: CameraConfig,
+    texture: TextureConfig,
+    seed: int,
+    heights_m: Heights = None,
 ) -> Path:
     """Record `views` views of one scene unless its shard exists; returns the shard's path.
 
@@ -53,7 +62,7 @@ def generate_shard(
         unfinished.unlink(missing_ok=True)
     scene = read_scene(scene_folder)
     rng = np.random.default_rng(_scene_seed(scene_folder, seed))
-    source = ViewSource(scene, camera, texture, rng)
+    source = ViewSource(scene, camera, texture, rng, heights_m)
     write_shard(path, scene, (source.draw() for _ in range(views)), camera, texture, seed)
     return path
 
@@ -66,6 +75,7 @@ def generate(
     texture: TextureConfig,
     seed: int,
     workers: int = 1,
+    heights_m: Heights = None,
 ) -> dict[str, str]:
     """Record every scene into `out` and write `manifest.json` there: configuration, seeds, SHA-256 of each shard.
 
@@ -74,6 +84,8 @@ def generate(
     Returns the failures, scene name -> message. Raises `InputError` if `out` has a manifest of another run.
     """
     run = {**recorded_with(camera, texture), "seed": seed, "views": views}
+    if heights_m is not None:
+        run["heights_m"] = heights_m
     listed = _listed(out, run)
     existing = [folder for folder in scene_folders if shard_path(folder, out).exists()]
     missing = [folder for folder in scene_folders if folder not in existing]
@@ -81,7 +93,14 @@ def generate(
     for folders, sums, what in (existing, listed, "existing shards"), (missing, {}, f"views of {out.name}"):
         jobs = (
             joblib.delayed(_attempt)(
-                folder, out, views, camera, texture, seed, sums.get(shard_path(folder, out).name, {}).get("sha256")
+                folder,
+                out,
+                views,
+                camera,
+                texture,
+                seed,
+                heights_m,
+                sums.get(shard_path(folder, out).name, {}).get("sha256"),
             )
             for folder in folders
         )
@@ -104,12 +123,13 @@ def _attempt(
     camera: CameraConfig,
     texture: TextureConfig,
     seed: int,
+    heights_m: Heights,
     listed: str | None,
 ) -> str | InputError:
     """SHA-256 of the scene's shard, recorded now if missing, or its failure; it has to be `listed`, if given."""
 
     def record() -> str:
-        path = generate_shard(folder, out, views, camera, texture, seed)
+        path = generate_shard(folder, out, views, camera, texture, seed, heights_m)
         if listed:
             _check_sum(path, listed)
         return checksum(path)
@@ -181,7 +201,8 @@ def _read_manifest(out: Path) -> dict[str, Any]:
         CameraConfig(**manifest["camera"])
         if not all(isinstance(entry["sha256"], str) for entry in manifest["shards"].values()):
             raise TypeError("a shard without SHA-256")
-        return {key: manifest[key] for key in ("camera", "modsem_share", "seed", "views", "shards")}
+        keys = ("camera", "modsem_share", "seed", "views", "shards")
+        return {key: manifest[key] for key in (*keys, *(("heights_m",) if "heights_m" in manifest else ()))}
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         found = "nothing" if isinstance(error, FileNotFoundError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: expected a manifest of shards, found {found}") from None
@@ -216,6 +237,15 @@ def run(options: argparse.Namespace) -> None:
     with cluster(options.dask):
         for split in SPLITS:
             folders, out = list(found.of(split)), options.out / split
-            broken |= generate(folders, out, views, setting.camera, setting.texture, options.seed, options.workers)
+            broken |= generate(
+                folders,
+                out,
+                views,
+                setting.camera,
+                setting.texture,
+                options.seed,
+                options.workers,
+                setting.scenes.heights_m,
+            )
     if broken:
         sys.exit("\n".join(f"skipped {name}: {message}" for name, message in broken.items()))

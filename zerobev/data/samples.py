@@ -3,11 +3,12 @@
 Batches are dicts of tensors (B samples, K modalities, H pixels and M cells per side): `rgb` (B, 3, H, H) uint8; `zero`
 (B, K, H, H) and `target` (B, K, M, M) bool; `aux` (B, 2, M, M) bool, obstacles and navigable space; `fov` (B, 1, M, M)
 bool; `depth` (B, 1, H, H) float32, metres; `scene` (B,) int64. Images and masks are sent to processes and GPUs with
-one byte per value; networks take the result of `as_float`.
+one byte per value; networks take the result of `as_float`. If views are from different heights, batches have `height`
+(B,) float32, metres.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -16,17 +17,24 @@ import torch
 
 from zerobev.common.errors import InputError
 from zerobev.config import LABELS, CameraConfig
+from zerobev.data.sensor_depth import mixed_depth
 from zerobev.data.shards import Shard
 from zerobev.data.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.data.views import View
 from zerobev.geometry.cameras import Pose, bev_cell_centres
 from zerobev.geometry.projection import inverse_project_mask, map_coordinates
 
-Sample = dict[str, np.ndarray | np.int64]
+Sample = dict[str, np.ndarray | np.generic]
 #: K modalities in the image (K, H, H) and on the map (K, M, M), bool or float.
 Pair = tuple[np.ndarray, np.ndarray]
 #: Period of the top view in texels of 1 cm, the largest for int16; the world's origin is in the middle.
 _TOP_VIEW_TEXELS = 2**15
+
+#: Smallest and largest fraction of the instances in white.
+_OBJECTS = (0.03, 0.4)
+
+#: Changes a sample of a view of a scene with so many charts.
+Augment = Callable[[Sample, View, int, np.random.Generator], Sample]
 
 _cell_centres = cache(bev_cell_centres)
 
@@ -35,24 +43,36 @@ class ViewSet:
     """The views of several shards under one index: the first `max_views` of each shard, or all.
 
     depth: replaces the views' depth, see `with_depth`
+    estimates: depth beside it, see `with_estimates`
     """
 
     def __init__(
-        self, shards: list[Shard], max_views: int | None = None, depth: Sequence[np.ndarray] | None = None
+        self,
+        shards: list[Shard],
+        max_views: int | None = None,
+        depth: Sequence[np.ndarray] | None = None,
+        estimates: Sequence[np.ndarray] | None = None,
     ) -> None:
         self.shards = shards
         self._max_views = max_views
         self._start = np.cumsum(
             [0, *(len(shard) if max_views is None else min(len(shard), max_views) for shard in shards)]
         )
-        self._depth = depth
+        self._depth, self._estimates = depth, estimates
 
     def __len__(self) -> int:
         return int(self._start[-1])
 
+    @property
+    def depth_maps(self) -> Sequence[np.ndarray]:
+        """The maps of `with_depth`. Raises `InputError` if the depth is the views' own."""
+        if self._depth is None:
+            raise InputError("depth maps: expected views with other depth, found none")
+        return self._depth
+
     def first(self, max_views: int | None) -> "ViewSet":
         """The first `max_views` of these views per shard, or all."""
-        return ViewSet(self.shards, self._max_views if max_views is None else max_views, self._depth)
+        return ViewSet(self.shards, self._max_views if max_views is None else max_views, self._depth, self._estimates)
 
     def with_depth(self, maps: Sequence[np.ndarray]) -> "ViewSet":
         """The same views with other depth, for example estimated depth.
@@ -65,6 +85,18 @@ class ViewSet:
         if found != expected:
             raise InputError(f"depth maps: expected {expected} views per shard, found {found}")
         return ViewSet(self.shards, self._max_views, maps)
+
+    def with_estimates(self, maps: Sequence[np.ndarray]) -> "ViewSet":
+        """The same views, with estimated depth beside true depth, for `estimate`; `maps` as in `with_depth`."""
+        checked = self.with_depth(maps)
+        return ViewSet(self.shards, self._max_views, self._depth, checked._depth)
+
+    def estimate(self, index: int) -> np.ndarray | None:
+        """(H, H) float32, estimated depth of view `index`, metres; None without estimates."""
+        if self._estimates is None:
+            return None
+        shard = int(np.searchsorted(self._start, index, side="right")) - 1
+        return np.asarray(self._estimates[shard][index - int(self._start[shard])], np.float32)
 
     def locate(self, index: int) -> tuple[int, View]:
         """Number of the shard that holds view `index`, and the view."""
@@ -103,16 +135,24 @@ class SampleStream(ABC):
 
     empty_fraction: fraction of the samples with an empty modality, in the image and on the map. Textures fill every
         view, but the mask of a class is empty in most views, and the map of an empty image is empty.
+    augment: changes each sample at random
     """
 
     def __init__(
-        self, views: ViewSet, camera: CameraConfig, seed: int, batch: int, empty_fraction: float = 0.0
+        self,
+        views: ViewSet,
+        camera: CameraConfig,
+        seed: int,
+        batch: int,
+        empty_fraction: float = 0.0,
+        augment: Augment | None = None,
     ) -> None:
         self._views = views
         self._camera = camera
         self._seed = seed
         self._batch = batch
         self._empty_fraction = empty_fraction
+        self._augment = augment
         self._order = ViewSampler(len(views), seed)
 
     @abstractmethod
@@ -126,12 +166,17 @@ class SampleStream(ABC):
 
     def sample(self, index: int) -> Sample:
         """Sample `index`."""
-        scene, view = self._views.locate(self._order[index])
+        number = self._order[index]
+        scene, view = self._views.locate(number)
         rng = np.random.default_rng([self._seed, 1, index])
         zero, target = self.pair(view, scene, rng)
         if rng.random() < self._empty_fraction:
             zero, target = np.zeros_like(zero), np.zeros_like(target)
-        return view_sample(view, self._camera, scene, zero, target)
+        sample = view_sample(view, self._camera, scene, zero, target)
+        estimate = self._views.estimate(number)
+        if estimate is not None:
+            sample["depth"] = mixed_depth(view.depth, estimate, view.rgb, rng)[None]
+        return self._augment(sample, view, self._views.shards[scene].charts, rng) if self._augment else sample
 
 
 class SynthSamples(SampleStream):
@@ -144,6 +189,8 @@ class SynthSamples(SampleStream):
         along the vertical on raised surfaces. Without extrusion the map shows the texture of the upper side of a wall
         or a shelf and the camera that of its front, which is independent of it. Classes and most other modalities are
         constant along the vertical; the network learns the positions of raised surfaces from extruded samples.
+    objects_fraction: fraction of the samples with a random set of whole instances in white, drawn per sample; nothing
+        in the photograph predicts the set
     """
 
     def __init__(
@@ -154,10 +201,13 @@ class SynthSamples(SampleStream):
         seed: int,
         batch: int,
         empty_fraction: float = 0.0,
+        augment: Augment | None = None,
         fresh: bool = True,
         extruded_fraction: float = 0.0,
+        objects_fraction: float = 0.0,
     ) -> None:
-        super().__init__(views, camera, seed, batch, empty_fraction)
+        super().__init__(views, camera, seed, batch, empty_fraction, augment)
+        self._objects_fraction = objects_fraction
         self._bank = bank
         self._fresh = fresh
         self._extruded_fraction = extruded_fraction
@@ -165,6 +215,10 @@ class SynthSamples(SampleStream):
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
         """The texture on the surfaces, in the image and on the map."""
         shard = self._views.shards[scene]
+        if self._objects_fraction and rng.random() < self._objects_fraction:
+            white = rng.random(len(shard.instance_label)) < rng.uniform(*_OBJECTS)
+            white[0] = False  # unknown, or no surface
+            return white[view.fpv_instance][None], white[view.bev_instance][None]
         if not self._fresh:
             rng = np.random.default_rng([self._seed, 2, scene])
         draw = self._bank.draw(rng, shard.charts + 1)  # the last one is for extruded surfaces
@@ -183,6 +237,8 @@ def extruded_texels(view: View, camera: CameraConfig, chart: int) -> tuple[np.nd
     vertical. In the image, surfaces above `max_height_m` keep their texels: the map does not show them.
     """
     x, y, height = (of.numpy() for of in map_coordinates(torch.from_numpy(view.depth), camera))
+    if view.height_m is not None:
+        height = height * np.float32(view.height_m / camera.height_m)
     under_ceiling = np.where(height < camera.max_height_m, height, 0)
     images = (view.fpv_texel, x, y, under_ceiling), (view.bev_texel, *_cell_centres(camera), view.bev_height)
     # pixels and cells together: for small images half the time is call overhead
@@ -212,7 +268,7 @@ class DepthProjSamples(SampleStream):
     def pair(self, view: View, scene: int, rng: np.random.Generator) -> Pair:
         """Rectangles in the image, and the map cells of their pixels."""
         zero = random_rectangles(view.depth.shape, rng)
-        return zero[None], inverse_project_mask(zero, view.depth, self._camera)[None]
+        return zero[None], inverse_project_mask(zero, view.depth, view.seen_by(self._camera))[None]
 
 
 class SemanticSamples(SampleStream):
@@ -262,7 +318,8 @@ def view_sample(view: View, camera: CameraConfig, scene: int, zero: np.ndarray, 
     """A sample of a view and its modality in the image, `zero` (K, H, H), and on the map, `target` (K, M, M)."""
     surface = view.bev_texel[..., 0] >= 0
     obstacle = surface & (view.bev_height > camera.obstacle_m)
-    return {
+    height: Sample = {} if view.height_m is None else {"height": np.float32(view.height_m)}
+    return height | {
         "rgb": np.moveaxis(view.rgb, -1, 0),
         "depth": view.depth[None].astype(np.float32),
         "zero": zero,

@@ -1,6 +1,6 @@
 """A view: all that the sensors record at one pose. `ViewSource` draws poses that see enough of the map."""
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -32,14 +32,36 @@ class View:
     bev_modsem: np.ndarray  #: (M, M) uint8
     bev_height: np.ndarray  #: (M, M) float32, metres above the floor
     fov: np.ndarray  #: (M, M) bool: cells inside the field of view
-    pose: np.ndarray  #: (4,) float64: x, y, height of the floor (metres, world), yaw (radians)
+    #: (4,) or (5,) float64: x, y, height of the floor (metres, world), yaw (radians); height of the camera above the
+    #: floor (metres) if it differs between views
+    pose: np.ndarray
+
+    @property
+    def height_m(self) -> float | None:
+        """Height of the camera above the floor, if it differs between views."""
+        return float(self.pose[4]) if len(self.pose) > 4 else None
+
+    def seen_by(self, camera: CameraConfig) -> CameraConfig:
+        """`camera` with the limits on heights that hold in this view."""
+        return camera if self.height_m is None else camera.at_height(self.height_m)
 
 
 class ViewSource:
-    """Draws views of one scene. `texture` sets the *Mod. Sem.* textures; poses do not depend on it."""
+    """Draws views of one scene. `texture` sets the *Mod. Sem.* textures; poses do not depend on it.
 
-    def __init__(self, scene: Scene, camera: CameraConfig, texture: TextureConfig, rng: np.random.Generator) -> None:
+    heights_m: range of the camera's heights above the floor; None: that of `camera`
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: CameraConfig,
+        texture: TextureConfig,
+        rng: np.random.Generator,
+        heights_m: tuple[float, float] | None = None,
+    ) -> None:
         self._agent = AgentConfig()
+        self._heights_m = heights_m
         self._camera = camera
         self._rng = rng
         self.scene = scene
@@ -58,7 +80,7 @@ class ViewSource:
         Raises `InputError` if none is found.
         """
         for _ in range(_MAX_TRIES):
-            pose = self.floor.draw(self._rng)
+            pose = self.floor.draw(self._rng, self._heights_m)
             view = self.at(pose)
             if view is not None:
                 return view
@@ -72,7 +94,7 @@ class ViewSource:
         if self._camera.fpv_px > _PREVIEW_PX and self._is_blocked(replace(self._camera, fpv_px=_PREVIEW_PX), pose):
             return None
         fpv = self._caster.fpv(pose, self._camera)
-        fov = fov_mask(fpv.distance, self._camera)
+        fov = fov_mask(fpv.distance, _at(pose, self._camera))
         if fov.mean() < self._agent.min_view:
             return None
         bev = self._caster.bev(pose, self._camera)
@@ -87,8 +109,13 @@ class ViewSource:
             bev_modsem=self._modsem.take(bev.atlas),
             bev_height=bev.distance,
             fov=fov,
-            pose=np.array([pose.x, pose.y, pose.floor_z, pose.yaw]),
+            pose=np.array([value for value in astuple(pose) if value is not None]),
         )
 
     def _is_blocked(self, camera: CameraConfig, pose: Pose) -> bool:
-        return fov_mask(self._caster.fpv(pose, camera).distance, camera).mean() < self._agent.min_view
+        fov = fov_mask(self._caster.fpv(pose, camera).distance, _at(pose, camera))
+        return fov.mean() < self._agent.min_view
+
+
+def _at(pose: Pose, camera: CameraConfig) -> CameraConfig:
+    return camera if pose.height_m is None else camera.at_height(pose.height_m)

@@ -1,15 +1,20 @@
 """Evaluate the shipped weights on a folder of homes.
 
-Reads homes in HM3DSem layout; prints a table and writes the counts with `--json`. The networks were trained only on
-generated homes, so all annotated scenes of the folder are test scenes. Views are rendered, not stored. Rows as in
-Table 1: P^-1 with true depth (a.1) and with estimated depth (a.2), and the shipped networks.
+Reads homes in HM3DSem layout: a data set, one of its parts such as `val/`, or one scene. Prints IoU, depth errors and
+the homes that fail most, and writes all of it with `--json`. The networks were trained only on generated homes, so all
+annotated scenes of the folder are test scenes. Views are rendered, not stored. Rows: P^-1 with true depth (a.1) and
+with estimated depth (a.2); the shipped networks, residual ones also with the depth of a depth camera (.sensor, see
+`data.sensor_depth`) and with true depth (.true); floor over the whole field of view (constant).
 """
 
 import argparse
 import sys
 import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,61 +26,207 @@ from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.data.samples import as_float, class_masks, collate, view_sample
+from zerobev.data.sensor_depth import completed, sensor_depth
 from zerobev.data.views import ViewSource
-from zerobev.evaluation.evaluate import Predictor, evaluate
+from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
 from zerobev.geometry.projection import inverse_project
-from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.inference.projector import GEOMETRIC, Projector, load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
-from zerobev.scenes.readers import find_scenes, read_scene
+from zerobev.models.variants import VARIANTS
+from zerobev.scenes.readers import list_scenes, read_scene
+from zerobev.training.loader import Batch
 
-ORACLE = "a.1"
-METHODS = {ORACLE: "P^-1 with true depth", GEOMETRIC: "P^-1 with estimated depth"} | {
-    row: f"Zero-BEV ({row})" for row in ROWS
+ORACLE, CONSTANT = "a.1", "constant"
+_RESIDUAL = tuple(row for row in ROWS if VARIANTS[row][1].get("residual"))
+#: Row -> title.
+METHODS = {
+    ORACLE: "P^-1 with true depth",
+    GEOMETRIC: "P^-1 with estimated depth",
+    **{row: f"Zero-BEV ({row})" for row in ROWS},
+    **{
+        f"{row}.{depth}": f"Zero-BEV ({row}) with {text}"
+        for row in _RESIDUAL
+        for depth, text in (("sensor", "a depth camera"), ("true", "true depth"))
+    },
+    CONSTANT: "floor over the whole field of view",
 }
+_FLOOR = LABELS.index("floor")
+_WORST = 3  # homes that are discussed
+# from here on, a property of a home counts as a reason of its failure
+_FLOOR_OFF, _DEPTH_OFF, _DARK, _NEAR_M = 0.1, 0.2, 0.25, 1.5
 
 
-def render_views(folder: Path, number: int, views: int, camera: CameraConfig, seed: int) -> dict[str, Tensor]:
-    """`views` random views of a scene as one batch, with the eight classes as modalities; `scene` is `number`."""
+@dataclass(frozen=True)
+class DepthReport:
+    """Estimated depth in the views of a home, and what may explain its errors."""
+
+    relative: float  #: mean of absolute difference over true depth
+    mad_m: float  #: mean absolute difference, metres
+    floor_ratio: float  #: median of estimated over true depth on the floor; NaN without visible floor
+    brightness: float  #: mean of the photographs, in [0, 1]
+    median_m: float  #: median of true depth, metres
+
+    def reasons(self) -> str:
+        """Probable reasons of wrong maps, in words."""
+        found = []
+        if abs(self.floor_ratio - 1) > _FLOOR_OFF:
+            found.append(f"estimated depth puts the floor at {self.floor_ratio:.2f} of its distance")
+        elif self.relative > _DEPTH_OFF:
+            found.append(f"estimated depth is {self.relative:.0%} off, on walls and objects: the floor is right")
+        if self.brightness < _DARK:
+            found.append(f"the photographs are dark (mean brightness {self.brightness:.2f})")
+        if self.median_m < _NEAR_M:
+            found.append(f"most surfaces are near (median {self.median_m:.1f} m), so little floor is in view")
+        return "; ".join(found) or "depth is right here: the map is what fails"
+
+
+@dataclass(frozen=True)
+class HomeResult:
+    """Counts of one home per row of `METHODS`, each with one scene, and its depth."""
+
+    counts: dict[str, Counts]
+    depth: DepthReport
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of all homes that could be evaluated, by name, and the failures of the others."""
+
+    homes: dict[str, HomeResult]
+    broken: dict[str, str]
+
+    @property
+    def counts(self) -> dict[str, Counts]:
+        """Counts per row of `METHODS`, a scene per home."""
+        per_row = {row: [home.counts[row] for home in self.homes.values()] for row in METHODS}
+        return {
+            row: Counts(
+                np.concatenate([one.intersection for one in counts]), np.concatenate([one.union for one in counts])
+            )
+            for row, counts in per_row.items()
+        }
+
+    def worst(self) -> list[str]:
+        """A line for each of the homes in which the last shipped row is worst, relative to the oracle (a.1)."""
+
+        def share(home: HomeResult) -> float:
+            return home.counts[ROWS[-1]].class_iou() / max(home.counts[ORACLE].class_iou(), 1e-9)
+
+        by_share = sorted(self.homes.items(), key=lambda item: share(item[1]))
+        return [
+            f"{name}: ({ROWS[-1]}) has {share(home):.2f} of ({ORACLE})'s class IoU; {home.depth.reasons()}"
+            for name, home in by_share[:_WORST]
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Averages, counts per home in the order of `scenes`, and depth errors, as plain data."""
+        rows = {
+            row: {
+                "class_iou": one.class_iou(),
+                "pixel_iou": one.pixel_iou(),
+                "weights": run_of(shipped(row.removesuffix(".true").removesuffix(".sensor")))
+                if _is_network(row)
+                else None,
+                **one.to_json(),
+            }
+            for row, one in self.counts.items()
+        }
+        by_home = {name: asdict(home.depth) for name, home in self.homes.items()}
+        means = {name: float(np.mean([one[name] for one in by_home.values()])) for name in ("relative", "mad_m")}
+        return {"scenes": list(self.homes), "rows": rows, "depth": {**means, "by_home": by_home}}
+
+
+def _is_network(row: str) -> bool:
+    return row not in (ORACLE, GEOMETRIC, CONSTANT)
+
+
+def render_views(folder: Path, views: int, camera: CameraConfig, seed: int) -> dict[str, Tensor]:
+    """`views` random views of a scene as one batch, with the eight classes as modalities.
+
+    `sensor` (B, 1, H, H) float32 is the depth of a depth camera, metres, 0 for no value.
+    """
     scene = read_scene(folder)
     rng = np.random.default_rng([seed, zlib.crc32(folder.name.encode())])
     source = ViewSource(scene, camera, TextureConfig(), rng)
     drawn = [source.draw() for _ in range(views)]
-    return as_float(
-        collate([view_sample(view, camera, number, *class_masks(view, scene.instance_label)) for view in drawn])
+    batch = as_float(
+        collate([view_sample(view, camera, 0, *class_masks(view, scene.instance_label)) for view in drawn])
     )
+    noise = rng.spawn(1)[0]
+    measured = np.stack([sensor_depth(view.depth, view.rgb, noise)[None] for view in drawn])
+    return batch | {"sensor": torch.from_numpy(measured)}
 
 
-def evaluate_homes(folders: list[Path], views: int, seed: int = 0) -> tuple[dict[str, Counts], dict[str, str]]:
-    """Intersections and unions per row of `METHODS`, on `views` views per scene.
+def evaluate_homes(
+    folders: Iterable[Path], views: int, seed: int = 0, report: Callable[[str], None] = print
+) -> Results:
+    """All rows of `METHODS` on `views` views per scene.
 
-    Returns the counts without the scenes that failed, and the messages of these, by name.
+    report: gets a line per finished home
     Raises `InputError` if all scenes fail.
     """
     if views < 1:
         raise InputError(f"views: expected 1 or more, found {views}")
-    projectors = {row: load(row) for row in (GEOMETRIC, *ROWS)}
-    camera = projectors[GEOMETRIC].camera
-    methods: dict[str, Predictor] = {ORACLE: lambda batch: inverse_project(batch["zero"], batch["depth"], camera) > 0}
-    methods |= {row: projector.predict for row, projector in projectors.items()}
-    total = {row: Counts.empty(len(folders), len(LABELS)) for row in METHODS}
+    folders = list(folders)
+    projectors = {row: load(row) for row in ROWS}
+    homes: dict[str, HomeResult] = {}
     broken: dict[str, str] = {}
-
-    def home_counts(number: int, folder: Path) -> dict[str, Counts]:
-        batch = render_views(folder, number, views, camera, seed)
-        return {row: evaluate(predict, [batch], len(folders), len(LABELS)) for row, predict in methods.items()}
-
-    for number, folder in enumerate(progress(folders, "homes", "home", len(folders))):
-        found = attempt(partial(home_counts, number, folder))
+    for number, folder in enumerate(progress(folders, "homes", "home", len(folders)), start=1):
+        found = attempt(partial(_home_result, folder, views, seed, projectors))
         if isinstance(found, InputError):
             broken[folder.name] = str(found)
+            report(f"[{number}/{len(folders)}] {folder.name}: skipped: {found}")
             continue
-        for row, one in found.items():
-            total[row] += one
+        homes[folder.name] = found
+        shown = found.counts[ROWS[-1]]
+        iou = f"({ROWS[-1]}) class {100 * shown.class_iou():.1f}, pixel {100 * shown.pixel_iou():.1f}"
+        report(f"[{number}/{len(folders)}] {folder.name}: {iou}; depth {found.depth.relative:.0%} off")
     if len(broken) == len(folders):
         raise InputError("; ".join(f"{name}: {message}" for name, message in broken.items()))
-    good = [number for number, folder in enumerate(folders) if folder.name not in broken]
-    return {row: Counts(c.intersection[good], c.union[good]) for row, c in total.items()}, broken
+    return Results(homes, broken)
+
+
+def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Projector]) -> HomeResult:
+    camera = projectors[ROWS[0]].camera
+    batch = render_views(folder, views, camera, seed)
+    with torch.inference_mode():
+        estimated = projectors[ROWS[0]].estimator(batch["rgb"])
+    pairs = zip(batch["sensor"].numpy(), estimated.numpy())
+    measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
+    depths = {"": estimated, ".true": batch["depth"], ".sensor": measured}
+    heights = batch.get("height")
+    maps = {
+        ORACLE: inverse_project(batch["zero"], batch["depth"], camera, heights) > 0,
+        GEOMETRIC: inverse_project(batch["zero"], estimated, camera, heights) > 0,
+        CONSTANT: torch.zeros_like(batch["target"], dtype=torch.bool),
+    }
+    maps[CONSTANT][:, _FLOOR] = True
+    with torch.inference_mode():
+        for row, projector in projectors.items():
+            assert projector.network is not None  # as all shipped rows
+            for suffix, depth in depths.items() if row in _RESIDUAL else (("", estimated),):
+                maps[row + suffix] = projector.network(batch["rgb"], batch["zero"], depth, heights).zero_logits > 0
+    counts = {row: evaluate(partial(_given, maps[row]), [batch], 1, len(LABELS)) for row in METHODS}
+    return HomeResult(counts, _depth_report(batch, estimated))
+
+
+def _given(maps: Tensor, batch: Batch) -> Tensor:
+    return maps
+
+
+def _depth_report(batch: dict[str, Tensor], estimated: Tensor) -> DepthReport:
+    truth, floor = batch["depth"], batch["zero"][:, [_FLOOR]] > 0
+    known = truth > 0
+    error = (estimated - truth).abs()[known].double()
+    on_floor = (estimated / truth)[known & floor].double()
+    return DepthReport(
+        relative=float((error / truth[known]).mean()),
+        mad_m=float(error.mean()),
+        floor_ratio=float(on_floor.median()) if len(on_floor) else float("nan"),
+        brightness=float(batch["rgb"].mean()),
+        median_m=float(truth[known].median()),
+    )
 
 
 def results_table(counts: dict[str, Counts]) -> pd.DataFrame:
@@ -90,34 +241,39 @@ def results_table(counts: dict[str, Counts]) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=["row", "method", *LABELS, "class avg.", "pixel avg."]).set_index("row")
 
 
+def homes_table(homes: dict[str, HomeResult]) -> pd.DataFrame:
+    """Per home: class IoU in percent of each row, relative depth error in percent, and floor ratio."""
+    lines = {
+        name: {row: round(100 * home.counts[row].class_iou(), 1) for row in METHODS}
+        | {"depth error": round(100 * home.depth.relative, 1), "floor ratio": round(home.depth.floor_ratio, 2)}
+        for name, home in homes.items()
+    }
+    return pd.DataFrame(lines).T.rename_axis("home")
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `zerobev evaluate`."""
-    parser.add_argument("--scenes", type=Path, required=True, metavar="DIR", help="folder in HM3DSem layout")
+    parser.add_argument(
+        "--scenes", type=Path, required=True, metavar="DIR", help="data set in HM3DSem layout, part of one, or a scene"
+    )
     parser.add_argument("--views", type=int, default=40, help="per scene (default: 40)")
     parser.add_argument("--seed", type=int, default=0, help="of the poses")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the counts of every scene there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all results there")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Evaluate and print the table; exit code 1 if a scene was skipped."""
-    found = find_scenes(options.scenes)
-    by_name = {folder.name: folder for folders in found.values() for folder in folders}
-    folders = [by_name[name] for name in sorted(by_name)]
+    """Evaluate and print the tables; exit code 1 if a scene was skipped."""
     torch.manual_seed(0)
-    counts, broken = evaluate_homes(folders, options.views, options.seed)
-    names = [folder.name for folder in folders if folder.name not in broken]
-    print(f"{len(names)} homes, {options.views} views each; IoU in percent [90 % interval over homes]")
-    print(results_table(counts).to_string())
+    results = evaluate_homes(list_scenes(options.scenes), options.views, options.seed, partial(print, flush=True))
+    print(f"\n{len(results.homes)} homes, {options.views} views each; IoU in percent [90 % interval over homes]")
+    print(results_table(results.counts).to_string())
+    print(
+        "\nclass IoU per home, and estimated depth: mean relative error in percent, and on the floor, over true depth"
+    )
+    print(homes_table(results.homes).to_string())
+    print("\nthe homes that fail most")
+    print("\n".join(results.worst()))
     if options.json:
-        rows = {
-            row: {
-                "class_iou": one.class_iou(),
-                "pixel_iou": one.pixel_iou(),
-                "weights": run_of(shipped(row)) if row in ROWS else None,
-                **one.to_json(),
-            }
-            for row, one in counts.items()
-        }
-        write_json(options.json, {"scenes": names, "views": options.views, "seed": options.seed, "rows": rows})
-    if broken:
-        sys.exit("\n".join(f"skipped {name}: {message}" for name, message in broken.items()))
+        write_json(options.json, {"views": options.views, "seed": options.seed, **results.to_json()})
+    if results.broken:
+        sys.exit("\n".join(f"skipped {name}: {message}" for name, message in results.broken.items()))

@@ -28,6 +28,8 @@ from zerobev.training.distributed import rank_and_world_size
 
 #: The fields of `ModelConfig` that the network depends on.
 _FIELDS = ("width", "block", "depths", "channels", "stem_channels", "stem_stride")
+#: Further such fields, recorded where they differ from their defaults.
+_LATER_FIELDS = ("floor_depth",)
 
 _SEED = 0  # one estimator serves all seeds of all runs
 
@@ -45,8 +47,10 @@ class DepthPretraining:
         self.config: dict[str, Any] = {
             "version": versions.DEPTH,
             "data": workspace.data_config,
-            "model": {name: getattr(scale.model, name) for name in _FIELDS},
+            "model": {name: getattr(scale.model, name) for name in _FIELDS}
+            | {name: getattr(scale.model, name) for name in _LATER_FIELDS if getattr(scale.model, name)},
             "train": scale.depth,
+            "augment": scale.augment,
         }
         #: name of the run, with the fingerprint of its configuration
         self.key = key_of(f"depth-seed{_SEED}", self.config)
@@ -104,6 +108,11 @@ class DepthPretraining:
                     np.save(file, maps)
         return views.with_depth([np.load(path, mmap_mode="r") for path in paths])
 
+    def mixed_views(self, split: Split) -> ViewSet:
+        """The views of a split with true depth, and estimated depth beside it."""
+        estimated = self.views(split)
+        return self._workspace.views(split).with_estimates(estimated.depth_maps)
+
     def _compute(self) -> Record:
         workspace, scale = self._workspace, self._workspace.scale
         revision = git_revision()
@@ -117,6 +126,7 @@ class DepthPretraining:
             workspace.runs / self.key,
             _SEED,
             key=self.key,
+            augment=workspace.augmentation,
         )
         trained = time.monotonic()
         device = next(network.parameters()).device.type

@@ -115,9 +115,9 @@ def _estimated(wanted: Run) -> list[Split]:
     """Splits that a run reads with estimated depth."""
     if not wanted.experiment.reads_depth:
         return []
-    stages = wanted.experiment.stages
+    stages = wanted.experiment.stages(wanted.workspace.scale)
     depths = {"train": stages, "validation": stages[-1:], "test": (wanted.experiment.test_depth,)}
-    return [split for split in SPLITS if "estimated" in depths[split]]
+    return [split for split in SPLITS if {"estimated", "mixed"} & set(depths[split])]
 
 
 def _one_at_a_time(workspace: Workspace) -> FileLock:

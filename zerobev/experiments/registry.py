@@ -37,10 +37,11 @@ class Experiment:
         """Whether depth is an input; if not, `train_depth` and `test_depth` have no effect."""
         return self.network is None or VARIANTS[self.network][1].get("residual", False)
 
-    @property
-    def stages(self) -> tuple[Depth, ...]:
-        """Depth of each stage of training; one stage if depth is no input."""
-        return self.train_depth if self.reads_depth else ("true",)
+    def stages(self, scale: Scale) -> tuple[Depth, ...]:
+        """Depth of each stage of training; one stage if depth is no input, or of any quality."""
+        if not self.reads_depth:
+            return ("true",)
+        return ("mixed",) if scale.mixed_depth else self.train_depth
 
     def texture(self, scale: Scale) -> TextureConfig:
         """Textures in training."""

@@ -15,6 +15,7 @@ import torch
 from zerobev.common.keys import plain
 from zerobev.config import LABELS, CameraConfig, Depth, Split, one_of
 from zerobev.data.samples import (
+    Augment,
     DepthProjSamples,
     ModSemSamples,
     SemanticPass,
@@ -71,7 +72,11 @@ class Run:
             config |= {"model": wanted.model(scale), "backbone": self.backbone, "train": scale.train}
             config |= {"texture": workspace.texture_config(wanted.texture(scale))}
             config |= {"empty_fraction": wanted.empty_fraction(scale)}
-            config |= {"extruded_fraction": wanted.extruded_fraction(scale)}
+            config |= {"extruded_fraction": wanted.extruded_fraction(scale), "augment": scale.augment}
+            if scale.objects_fraction and wanted.stream == "synth":
+                config |= {"objects_fraction": scale.objects_fraction}
+            if scale.mixed_depth and wanted.reads_depth:
+                config |= {"mixed_depth": True}
         return config
 
     @property
@@ -180,8 +185,8 @@ class Run:
         torch.manual_seed(self.seed)
         model = build(wanted.network, scale.camera, wanted.model(scale))
         load_backbone(model.backbone, self.backbone or self.pretraining.weights)
-        data = InTurn([self.source("train", depth, self.seed) for depth in wanted.stages], config.steps)
-        held_out = self.source("validation", wanted.stages[-1], seed=0)
+        data = InTurn([self.source("train", depth, self.seed) for depth in wanted.stages(scale)], config.steps)
+        held_out = self.source("validation", wanted.stages(scale)[-1], seed=0)
         validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]
         objective = dice_objective(config.alpha, model.config.aux)
         history = train(
@@ -203,17 +208,22 @@ class Run:
         """Training samples of a split."""
         wanted, workspace, scale = self.experiment, self.workspace, self.workspace.scale
         views = self.views(split, depth)
-        common = (scale.camera, seed, scale.train.batch, wanted.empty_fraction(scale))
+        augment = workspace.augmentation if split == "train" else None
+        common = (scale.camera, seed, scale.train.batch, wanted.empty_fraction(scale), augment)
         if wanted.stream == "synth":
             bank = workspace.bank(wanted.texture(scale))
-            return SynthSamples(views, bank, *common, wanted.fresh, wanted.extruded_fraction(scale))
-        kinds: dict[str, Callable[[ViewSet, CameraConfig, int, int, float], Source]]
+            return SynthSamples(
+                views, bank, *common, wanted.fresh, wanted.extruded_fraction(scale), scale.objects_fraction
+            )
+        kinds: dict[str, Callable[[ViewSet, CameraConfig, int, int, float, Augment | None], Source]]
         kinds = {"modsem": ModSemSamples, "depthproj": DepthProjSamples, "classes": SemanticSamples}
         return kinds[wanted.stream](views, *common)
 
     def views(self, split: Split, depth: Depth) -> ViewSet:
-        """The views of a split with true or estimated depth."""
+        """The views of a split with true or estimated depth, or with both, to be mixed."""
         one_of("depth", depth, Depth)
+        if depth == "mixed":
+            return self.pretraining.mixed_views(split)
         return self.workspace.views(split) if depth == "true" else self.pretraining.views(split)
 
 
@@ -245,4 +255,4 @@ class InTurn:
 
 def _projection(camera: CameraConfig) -> Predictor:
     """P^-1 with the depth of the batch, rows (a)."""
-    return lambda batch: inverse_project(batch["zero"], batch["depth"], camera) > 0
+    return lambda batch: inverse_project(batch["zero"], batch["depth"], camera, batch.get("height")) > 0

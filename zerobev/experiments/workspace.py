@@ -19,7 +19,8 @@ from zerobev.common.keys import fingerprint
 from zerobev.common.locks import locked
 from zerobev.common.paths import report_name, zerobev_home
 from zerobev.common.settings import changed_by
-from zerobev.config import SCALES, SPLITS, Split, TextureConfig
+from zerobev.config import SCALES, SPLITS, AugmentConfig, Split, TextureConfig
+from zerobev.data.augment import Augmentation
 from zerobev.data.generate import generate, shard_path
 from zerobev.data.patterns import SourceImages
 from zerobev.data.samples import ViewSet
@@ -129,10 +130,26 @@ class Workspace:
             if not self.source:
                 ensure_homes(folders, self.scale.scenes.seed, self._workers)
             views = self.scale.scenes.views
-            broken = generate(folders, out, views, self.scale.camera, self.scale.texture, seed, self._workers)
+            broken = generate(
+                folders,
+                out,
+                views,
+                self.scale.camera,
+                self.scale.texture,
+                seed,
+                self._workers,
+                self.scale.scenes.heights_m,
+            )
             if broken:
                 raise InputError("; ".join(broken.values()))
         return ViewSet([Shard(shard_path(f, out), self.scale.camera, self.scale.texture) for f in folders])
+
+    @cached_property
+    def augmentation(self) -> Augmentation | None:
+        """The random changes of training samples; None if the scale has none."""
+        if self.scale.augment == AugmentConfig():
+            return None
+        return Augmentation(self.scale.augment, self.scale.camera, self.bank())
 
     def bank(self, texture: TextureConfig | None = None) -> TextureBank:
         """A texture bank, by default of this scale's textures, from DTD's images or procedural images."""

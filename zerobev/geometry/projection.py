@@ -33,10 +33,12 @@ def map_points(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
     return torch.stack(map_coordinates(depth, camera), dim=-1)
 
 
-def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
+def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig, height_m: torch.Tensor | None = None) -> torch.Tensor:
     """Index row * M + column of the map cell of each pixel; M * M for "no cell".
 
     depth: (..., H, W) planar depth, metres; 0: nothing seen
+    height_m: (...) heights of the cameras of images that are stretched to `camera`; default: its own, see
+        `CameraConfig.at_height`
     Points at or above `max_height_m` have no cell. Returns (..., H, W) int64.
     """
     x, y, z = map_coordinates(depth, camera)
@@ -44,11 +46,16 @@ def cells_of_pixels(depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
     column = torch.floor((x + camera.bev_extent_m / 2) / camera.cell_m).long()
     row = side - 1 - torch.floor(y / camera.cell_m).long()
     on_map = (column >= 0) & (column < side) & (row >= 0) & (row < side)
-    seen = (depth > 0) & (z < camera.max_height_m)
+    limit: float | torch.Tensor = camera.max_height_m
+    if height_m is not None:
+        limit = (camera.max_height_m * camera.height_m / height_m)[..., None, None]
+    seen = (depth > 0) & (z < limit)
     return torch.where(on_map & seen, row * side + column, side * side)
 
 
-def inverse_project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> torch.Tensor:
+def inverse_project(
+    zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfig, height_m: torch.Tensor | None = None
+) -> torch.Tensor:
     """P^-1 with max-pooling to the ground: the value of a cell is the maximum over its pixels; 0 without a pixel.
 
     The paper counts points in voxels, drops those above 2 m, sums over height and thresholds at zero (supplement,
@@ -61,11 +68,12 @@ def inverse_project(zero: torch.Tensor, depth: torch.Tensor, camera: CameraConfi
 
     zero: (B, K, H, W) values >= 0
     depth: (B, 1, H, W) metres
+    height_m: (B,) heights of the cameras, see `cells_of_pixels`
     Returns (B, K, M, M).
     """
     batch, modalities = zero.shape[:2]
     side = camera.bev_px
-    cells = cells_of_pixels(depth, camera).view(batch, 1, -1).expand(batch, modalities, -1)
+    cells = cells_of_pixels(depth[:, 0], camera, height_m).view(batch, 1, -1).expand(batch, modalities, -1)
     pooled = zero.new_zeros(batch, modalities, side * side + 1)
     pooled = pooled.scatter_reduce(2, cells, zero.flatten(2), reduce="amax")
     return pooled[..., :-1].view(batch, modalities, side, side)

@@ -1,5 +1,6 @@
 """Projection of any modality of a photograph: masks, labels, probabilities, boxes, flow."""
 
+from zerobev.geometry.cameras import Camera
 from zerobev.inference.bev_map import BevArrows, BevMap
 from zerobev.inference.boxes import Boxes
 from zerobev.inference.detector import HubDetector
@@ -15,6 +16,7 @@ __all__ = [
     "BevArrows",
     "BevMap",
     "Boxes",
+    "Camera",
     "Flow",
     "HubDetector",
     "Labels",

@@ -11,8 +11,9 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from zerobev.common.errors import InputError
+from zerobev.common.errors import InputError, first_line
 from zerobev.common.storage import replacing
+from zerobev.geometry.cameras import Camera
 from zerobev.inference.bev_map import BevMap, color_of
 from zerobev.inference.boxes import Boxes
 from zerobev.inference.detector import HubDetector
@@ -41,14 +42,20 @@ def figure_of(rgb: np.ndarray, images: BinaryImages, bev: BevMap) -> plt.Figure:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `zerobev project`."""
-    parser.add_argument("image", type=Path, metavar="IMAGE", help="photograph, taken level, 0.88 m above the floor")
+    parser.add_argument("image", type=Path, metavar="IMAGE", help="photograph")
     kind = parser.add_mutually_exclusive_group(required=True)
     kind.add_argument("--masks", type=Path, nargs="+", metavar="FILE", help="images that are black outside the mask")
     kind.add_argument("--labels", type=Path, metavar="FILE", help="image of labels: grey values or palette indices")
     kind.add_argument("--boxes", type=Path, metavar="FILE", help="CSV: xmin,ymin,xmax,ymax,label and optionally score")
     kind.add_argument("--detector", metavar="NAME", help="object detector of transformers: hub name or folder")
     parser.add_argument("--ignore", metavar="LABEL", help=f"label of pixels without a class, often {IGNORE}; or none")
-    parser.add_argument("--hfov", type=float, default=79.0, help="horizontal field of view, degrees; default 79")
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--hfov", type=float, help="horizontal field of view, degrees; default 79")
+    lens.add_argument("--lens", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="calibration, pixels")
+    parser.add_argument("--height", type=float, default=0.88, help="of the camera above the floor, metres; default .88")
+    parser.add_argument("--pitch", type=float, default=0.0, help="degrees upwards; default 0, a level camera")
+    parser.add_argument("--roll", type=float, default=0.0, help="degrees clockwise; default 0, a level camera")
+    parser.add_argument("--depth", type=Path, metavar="FILE.npy", help="planar depth of a sensor, metres; 0: no value")
     parser.add_argument("--row", default=ROWS[-1], help=f"one of {', '.join((GEOMETRIC, *ROWS))}, or a checkpoint")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="an NPZ is written beside it")
 
@@ -63,11 +70,24 @@ def run(options: argparse.Namespace) -> None:
     rgb = read_image(options.image)
     modality = _modality(options, rgb)
     (images,) = modality.layers(rgb.shape[:2])
-    bev = load(options.row).project(rgb, modality, options.hfov)
+    depth = None if options.depth is None else _read_depth(options.depth)
+    bev = load(options.row).project(rgb, modality, _camera(options), depth)
     with replacing(options.out) as temporary:
         figure_of(rgb, images, bev).savefig(temporary, dpi=120)
     bev.save(options.out.with_suffix(".npz"))
     print(bev.footprints().round(2).to_string(index=False))
+
+
+def _camera(options: argparse.Namespace) -> Camera:
+    fx, fy, cx, cy = options.lens or (None,) * 4
+    return Camera(options.hfov, options.height, options.pitch, options.roll, fx, fy, cx, cy)
+
+
+def _read_depth(path: Path) -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: expected an array in NumPy's format .npy, found: {first_line(error)}") from None
 
 
 def _modality(options: argparse.Namespace, rgb: np.ndarray) -> Modality[BevMap]:

@@ -33,7 +33,8 @@ class BevModel(nn.Module):
     """A network with its configuration.
 
     Networks that predict maps are called as `model(rgb, zero, depth)` and return a `MapLogits`. Inputs, not all used by
-    every network: rgb (B, 3, H, W) in [0, 1], zero (B, K, H, W), depth (B, 1, H, W) in metres, all float32.
+    every network: rgb (B, 3, H, W) in [0, 1], zero (B, K, H, W), depth (B, 1, H, W) in metres, all float32. Zero-shot
+    networks also take `height_m` (B,), the heights of the cameras of stretched images (`CameraConfig.at_height`).
 
     Raises `InputError` for unknown auxiliary maps.
     """

@@ -49,10 +49,12 @@ class DepthNet(BevModel):
 
     Floor, walls and ceiling are planes; the inverse depth of a plane is affine in image coordinates, which convolutions
     extrapolate well. Ray directions are an input of the decoder, because the distance of the floor follows from the
-    image row only for a known camera.
+    image row only for a known camera. With `ModelConfig.floor_depth`, the network predicts by how much a surface is in
+    front of the floor: a level camera at a known height sees nothing behind it.
     """
 
     rays: Tensor  #: (1, 2, H, W)
+    least: Tensor  #: (H, W) minimum of the inverse depth, 1 / metres
 
     def __init__(self, camera: CameraConfig, model: ModelConfig):
         super().__init__(camera, model)
@@ -62,6 +64,10 @@ class DepthNet(BevModel):
         self.head = nn.Conv2d(model.width, model.stem_stride**2, 1)  # one channel per pixel under a finest feature
         rays = torch.from_numpy(fpv_rays(camera)[..., :2]).float().permute(2, 0, 1)[None]
         self.register_buffer("rays", rays, persistent=False)
+        least = torch.full((camera.fpv_px, camera.fpv_px), 1 / FARTHEST_M)
+        if model.floor_depth:
+            least = torch.maximum(least, rays[0, 1] / camera.height_m)
+        self.register_buffer("least", least, persistent=False)
 
     def forward(self, rgb: Tensor) -> Tensor:
         """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres, up to `FARTHEST_M`."""
@@ -73,7 +79,7 @@ class DepthNet(BevModel):
             fine = lateral(torch.cat([features, rays.to(features.dtype)], dim=1))
             merged = merge(fine if merged is None else fine + resize(merged, fine.shape[-2:]))
         pixels = F.pixel_shuffle(self.head(merged), self.config.stem_stride)[..., : rgb.shape[-2], : rgb.shape[-1]]
-        return 1 / (F.softplus(pixels.float()) + 1 / FARTHEST_M)
+        return 1 / (F.softplus(pixels.float()) + self.least)
 
 
 _MetricType = tuple[int | None, tuple[tuple[float, ...], tuple[float, ...]]]

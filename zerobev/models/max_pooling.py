@@ -87,15 +87,18 @@ class MaxPoolZeroBEV(BevModel):
         self.resample_pixels = PolarToCartesian(camera, rows, 1)
         self.resample_features = PolarToCartesian(camera, rows, stride)
         self.values = nn.Conv2d(model.width, model.width, 1)
-        self.embedding = nn.Conv2d(2 if model.residual else 1, model.width, 1)
+        self.embedding = nn.Conv2d(1 + model.residual * (1 + model.seen), model.width, 1)
         with torch.no_grad():
             self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
+    def forward(
+        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
+    ) -> MapLogits:
         """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
-        depth: (B, 1, H, W) metres, true or estimated; used only in the residual variant
+        depth: (B, 1, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
+        height_m: (B,) of the cameras, for the limit on heights of P^-1; default: `camera.height_m`
         """
         self.check_inputs(rgb, zero, depth)
         (features,) = self.pyramid(self.backbone(rgb))
@@ -105,7 +108,10 @@ class MaxPoolZeroBEV(BevModel):
         maps = [pooled]
         if self.config.residual:
             assert depth is not None  # as checked
-            maps.append(inverse_project(zero, depth, self.camera))
+            maps.append(inverse_project(zero, depth, self.camera, height_m))
+            if self.config.seen:
+                everything = inverse_project(torch.ones_like(zero[:, :1]), depth, self.camera, height_m)
+                maps.append(everything.expand_as(maps[-1]))
         embedded = self.embedding(torch.stack(maps, dim=2).flatten(0, 1)).unflatten(0, zero.shape[:2])
         inputs = (self.map_features(features, gates)[:, None] + embedded).flatten(0, 1)
         logits = torch.cat([self.decoder(part) for part in inputs.split(max(len(zero), IMAGES_PER_PASS))])

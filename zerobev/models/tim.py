@@ -32,7 +32,13 @@ class TIM(BevModel):
         self.bands = FpvToBev(camera, model)
         self.decoder = BevDecoder(model.width, model.decoder_channels, len(LABELS))
 
-    def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> MapLogits:
+    def forward(
+        self,
+        rgb: Tensor,
+        zero: Tensor | None = None,
+        depth: Tensor | None = None,
+        height_m: Tensor | None = None,
+    ) -> MapLogits:
         """RGB (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`.
 
         zero: (B, 8, H, W) masks of the classes in the order of `LABELS`; used only with `segmentation`

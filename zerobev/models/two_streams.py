@@ -40,8 +40,13 @@ class TwoStreamZeroBEV(BevModel):
         self.outs = nn.ModuleList(nn.Linear(c, model.width) for c in reversed(model.zero_channels))  # near band first
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
-        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `MapLogits`."""
+    def forward(
+        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
+    ) -> MapLogits:
+        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `MapLogits`.
+
+        Depth and heights are not used.
+        """
         batch = self.check(rgb=(rgb, 3), zero=(zero, None))
         rgb_features, attention = self.bands(self.pyramid(self.backbone(rgb)))
         zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])[::-1]  # near band first

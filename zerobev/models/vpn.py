@@ -51,7 +51,13 @@ class VPN(BevModel):
         )
         self.decoder = PyramidPooling(model.vpn_channels[-1], 2 * model.width, len(LABELS), model.dropout)
 
-    def forward(self, rgb: Tensor, zero: Tensor | None = None, depth: Tensor | None = None) -> MapLogits:
+    def forward(
+        self,
+        rgb: Tensor,
+        zero: Tensor | None = None,
+        depth: Tensor | None = None,
+        height_m: Tensor | None = None,
+    ) -> MapLogits:
         """RGB (B, 3, H, W) in [0, 1], float32 -> logits (B, 8, M, M) in the order of `LABELS`."""
         self.check(rgb=(rgb, 3))
         features = self.backbone(rgb)[-1]

@@ -36,21 +36,28 @@ class ZeroBEV(BevModel):
         self.pyramid = FeaturePyramid(tuple(map(sum, zip(model.channels, model.zero_channels))), model.width)
         self.bands = FpvToBev(camera, model)
         if model.residual:
-            self.embedding = nn.Conv2d(1, model.width, 1)
+            self.embedding = nn.Conv2d(1 + model.seen, model.width, 1)
             with torch.no_grad():
                 self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None) -> MapLogits:
+    def forward(
+        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
+    ) -> MapLogits:
         """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
-        depth: (B, 1, H, W) metres, true or estimated; used only in the residual variant
+        depth: (B, 1, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
+        height_m: (B,) of the cameras, for the limit on heights of P^-1; default: `camera.height_m`
         """
         self.check_inputs(rgb, zero, depth)
         images = [zero]
         if self.config.residual:
             assert depth is not None  # as checked
-            images.append(inverse_project(zero, depth, self.camera))
+            projected = inverse_project(zero, depth, self.camera, height_m)[:, :, None]
+            if self.config.seen:
+                everything = inverse_project(torch.ones_like(zero[:, :1]), depth, self.camera, height_m)
+                projected = torch.cat([projected, everything[:, :, None].expand_as(projected)], dim=2)
+            images.append(projected)
         laterals = self.rgb_laterals(rgb)
         parts = zip(*(image.split(max(1, IMAGES_PER_PASS // len(zero)), dim=1) for image in images))
         logits = torch.cat([self.pass_images(laterals, *part) for part in parts], dim=1)  # B K 1+aux M M
@@ -59,11 +66,11 @@ class ZeroBEV(BevModel):
     def pass_images(self, laterals: Sequence[Tensor], zero: Tensor, projected: Tensor | None = None) -> Tensor:
         """`rgb_laterals` of B images, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).
 
-        projected: (B, K, M, M), P^-1 of the zero-shot images, in the residual variant
+        projected: (B, K, 1 or 2, M, M), P^-1 of the zero-shot images, and of the whole view, in the residual variant
         """
         features, _ = self.bands(self.fpv_maps(laterals, zero))
         if projected is not None:
-            features = features + self.embedding(projected.flatten(0, 1)[:, None])
+            features = features + self.embedding(projected.flatten(0, 1))
         return self.decoder(features).unflatten(0, zero.shape[:2])
 
     def rgb_laterals(self, rgb: Tensor) -> list[Tensor]:

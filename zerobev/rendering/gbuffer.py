@@ -57,7 +57,10 @@ class RayCaster:
 
     def fpv(self, pose: Pose, camera: CameraConfig) -> GBuffer:
         """The pinhole camera's view; `distance` is planar depth."""
-        directions = _camera_rays(camera) @ pose.world_R_camera.T.astype(np.float32)
+        rays = _camera_rays(camera)
+        if pose.height_m is not None:
+            rays = rays * np.array([1, pose.stretch(camera), 1], np.float32)
+        directions = rays @ pose.world_R_camera.T.astype(np.float32)
         origins = np.broadcast_to(pose.centre(camera).astype(np.float32), directions.shape)
         return self._everything.cast(origins, directions)
 

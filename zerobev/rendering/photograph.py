@@ -49,6 +49,7 @@ class Photographer:
 
     def _render(self, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
         self._scene.set_pose(self._eye, world_T_opengl(pose, self._camera))
+        self._eye.camera.fy = self._eye.camera.fx / pose.stretch(self._camera)
         if not self._glass:
             return render(self._scene, self._flags, self._side)
         from zerobev.rendering.surfaces import Glass, from_back_to_front

@@ -28,11 +28,16 @@ class NavigableFloor:
         """Navigable area, m2."""
         return len(self.cells) * self.grid_m**2
 
-    def draw(self, rng: np.random.Generator) -> Pose:
-        """A pose with uniform position on the free floor and uniform heading."""
+    def draw(self, rng: np.random.Generator, heights_m: tuple[float, float] | None = None) -> Pose:
+        """A pose with uniform position on the free floor, uniform heading, and a height between `heights_m`, if given.
+
+        The logarithm of the height is uniform.
+        """
         x, y, z = self.cells[rng.integers(len(self.cells))]
         dx, dy = rng.uniform(-self.grid_m / 2, self.grid_m / 2, 2)
-        return Pose(float(x + dx), float(y + dy), float(z), float(rng.uniform(-np.pi, np.pi)))
+        yaw = float(rng.uniform(-np.pi, np.pi))
+        height = None if heights_m is None else float(np.exp(rng.uniform(*np.log(heights_m))))
+        return Pose(float(x + dx), float(y + dy), float(z), yaw, height)
 
 
 def navigable_floor(scene: Scene, agent: AgentConfig, rng: np.random.Generator) -> NavigableFloor:

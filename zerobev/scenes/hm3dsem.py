@@ -71,6 +71,20 @@ def find_scenes(root: Path) -> dict[str, list[Path]]:
     return found
 
 
+def list_scenes(root: Path) -> list[Path]:
+    """All annotated scene folders at `root`, sorted by name: of a data set, of one of its parts, or the scene itself.
+
+    Raises `InputError` if there is none.
+    """
+    root = Path(root)
+    alone = [root] if root.is_dir() and _is_annotated(root) else []
+    found = alone or [folder for folder in sorted(root.glob("[0-9]*-*")) if _is_annotated(folder)]
+    if not found:
+        by_name = {folder.name: folder for folders in find_scenes(root).values() for folder in folders}
+        found = [by_name[name] for name in sorted(by_name)]
+    return found
+
+
 def split_scenes(root: Path) -> SceneFolders:
     """Split the scenes of `root` as the paper does, or by name if that is not possible.
 

@@ -15,6 +15,9 @@ class Reader(Protocol):
     def find_scenes(self, root: Path) -> dict[str, list[Path]]:
         """The scene folders at `root` in each official part of the data set, sorted by name."""
 
+    def list_scenes(self, root: Path) -> list[Path]:
+        """All scene folders at `root`, sorted by name: of a data set, of one of its parts, or the scene itself."""
+
     def split_scenes(self, root: Path) -> SceneFolders:
         """The scene folders at `root` for training, validation and test."""
 
@@ -32,6 +35,11 @@ READERS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
 def find_scenes(root: Path) -> dict[str, list[Path]]:
     """As `Reader.find_scenes`, with the reader of `root`."""
     return _reader(root).find_scenes(root)
+
+
+def list_scenes(root: Path) -> list[Path]:
+    """As `Reader.list_scenes`, with the reader of `root`."""
+    return _reader(root).list_scenes(root)
 
 
 def split_scenes(root: Path) -> SceneFolders:

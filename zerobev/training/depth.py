@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
-from zerobev.data.samples import ViewSampler, ViewSet, as_float
+from zerobev.data.samples import Augment, Sample, ViewSampler, ViewSet, as_float
 from zerobev.models.depth import DepthEstimator
 from zerobev.training.history import History
 from zerobev.training.loader import Batch
@@ -25,10 +25,11 @@ class DepthSamples:
     """Endless pairs of image and depth, half of them mirrored; each pass over the views has a new random order.
 
     Sample i is a function of (seed, i) alone.
+    augment: changes each sample at random
     """
 
-    def __init__(self, views: ViewSet, seed: int, batch: int) -> None:
-        self._views, self._seed, self._batch = views, seed, batch
+    def __init__(self, views: ViewSet, seed: int, batch: int, augment: Augment | None = None) -> None:
+        self._views, self._seed, self._batch, self._augment = views, seed, batch, augment
         self._order = ViewSampler(len(views), seed)
 
     def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
@@ -38,8 +39,14 @@ class DepthSamples:
 
     def sample(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Image (H, W, 3) uint8 and depth (H, W) float32, metres."""
-        rgb, depth = _pair(self._views, self._order[index])
-        mirrored = np.random.default_rng([self._seed, 1, index]).random() < 0.5
+        scene, view = self._views.locate(self._order[index])
+        rng = np.random.default_rng([self._seed, 1, index])
+        rgb, depth = view.rgb, view.depth
+        mirrored = rng.random() < 0.5
+        if self._augment:
+            sample: Sample = {"rgb": np.moveaxis(rgb, -1, 0), "depth": depth[None]}
+            sample = self._augment(sample, view, self._views.shards[scene].charts, rng)
+            rgb, depth = np.moveaxis(np.asarray(sample["rgb"]), 0, -1), np.asarray(sample["depth"])[0]
         return (rgb[:, ::-1], depth[:, ::-1]) if mirrored else (rgb, depth)
 
 
@@ -60,14 +67,16 @@ def train_depth(
     seed: int,
     *,
     key: str,
+    augment: Augment | None = None,
     device: torch.device | str | None = None,
 ) -> History:
     """Train a `DepthEstimator` in place, to the weights with the best validation score (see `training.train`).
 
+    augment: changes each training sample at random
     validation: all its views, unmirrored; the score is the mean absolute difference over them, metres
     """
     held_out = [_views_batch(validation, first) for first in range(0, len(validation), _BATCH)]
-    data = DepthSamples(views, seed, config.batch)
+    data = DepthSamples(views, seed, config.batch, augment)
     return train(model, data, held_out, config, folder, seed, key=key, objective=depth_objective, device=device)
 
 

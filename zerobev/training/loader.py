@@ -77,8 +77,8 @@ def batches(
 
 
 def model_inputs(batch: Batch) -> list[Tensor]:
-    """Arguments of a model's call: `rgb`, `zero`, and `depth` if the batch has it."""
-    return [batch[name] for name in ("rgb", "zero", "depth") if name in batch]
+    """Arguments of a model's call: `rgb`, `zero`, and `depth` and `height` if the batch has them."""
+    return [batch[name] for name in ("rgb", "zero", "depth", "height") if name in batch]
 
 
 def moved(batch: Batch, device: torch.device) -> Batch:

@@ -21,7 +21,7 @@ from zerobev.experiments.runs import InTurn, Run, recorded, records_of
 from zerobev.experiments.spot_check import spot_check
 from zerobev.experiments.workspace import Workspace
 from zerobev.geometry.projection import inverse_project
-from zerobev.models import ZeroBEV
+from zerobev.models import BevModel, ZeroBEV
 from zerobev.models.variants import VARIANTS
 from zerobev.report.paper import TABLES
 from zerobev.training.losses import dice_loss
@@ -88,7 +88,7 @@ def test_a_misspelt_depth_stream_or_split_is_an_error(workspace):
         with pytest.raises(InputError, match=f"{field}: expected one of .*, found"):
             replace(RESIDUAL, **{field: value})
     run = Run(RESIDUAL, workspace)
-    with pytest.raises(InputError, match="depth: expected one of true, estimated, found 'predicted'"):
+    with pytest.raises(InputError, match="depth: expected one of true, estimated, mixed, found 'predicted'"):
         run.views("test", "predicted")
     with pytest.raises(InputError, match="split: expected one of train, validation, test, found 'val'"):
         workspace.views("val")
@@ -118,6 +118,7 @@ def test_projections_use_the_depth_of_their_row(workspace, row, predicted):
 def test_each_row_is_trained_on_its_own_auxiliary_maps(workspace, monkeypatch):
     """The auxiliary loss of a batch compares with the channels of the row."""
     objectives = {}
+    monkeypatch.setattr(BevModel, "save", lambda *_: None)  # the recorded weights stay
     monkeypatch.setattr(
         runs, "train", lambda model, *arguments, objective, **named: objectives.update(pair=(model, objective))
     )
@@ -160,6 +161,7 @@ def test_every_network_starts_from_the_depth_estimators_backbone(workspace, monk
     pretraining = DepthPretraining(workspace)
     weights = pretraining.estimator.backbone.state_dict()
     started = {}
+    monkeypatch.setattr(BevModel, "save", lambda *_: None)  # the recorded weights stay
     monkeypatch.setattr(runs, "train", lambda model, *arguments, **named: started.update(model=model))
     for row in VARIANTS:
         Run(EXPERIMENTS[row], workspace).train()

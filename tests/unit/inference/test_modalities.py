@@ -8,8 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from transformers import YolosConfig, YolosForObjectDetection
 
 from zerobev.common.errors import InputError
@@ -19,7 +17,6 @@ from zerobev.geometry.cameras import Pose
 from zerobev.inference import BevMap, Boxes, Flow, HubDetector, Projector
 from zerobev.inference.boxes import rendered_boxes
 from zerobev.inference.flow import flow_field, read_flo
-from zerobev.inference.pinhole import PinholeView
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer
 from zerobev.scenes.moving import movable, moved
@@ -27,74 +24,6 @@ from zerobev.scenes.moving import movable, moved
 from support.scenes import box, build, furnished, room
 
 CAMERA = CameraConfig(fpv_px=64, bev_px=40)
-
-
-# --- resampling to the network's camera ---------------------------------------------------------------------------
-
-
-def scene_of_rays(width: int, height: int, hfov_deg: float) -> np.ndarray:
-    """(H, W, 3) image of a pinhole camera in a world with colours affine in the ray."""
-    focal = width / 2 / np.tan(np.radians(hfov_deg) / 2)
-    x, y = np.meshgrid(*((np.arange(length) + 0.5 - length / 2) / focal for length in (width, height)))
-    return np.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 + 0.1 * (x - y)], axis=-1)
-
-
-@pytest.mark.parametrize(("width", "height", "hfov"), [(64, 64, 79), (640, 480, 95), (301, 233, 60), (90, 200, 79)])
-def test_a_resampled_photograph_is_that_of_the_network_s_camera(width, height, hfov):
-    view = PinholeView((height, width), hfov, CAMERA)
-    expected = scene_of_rays(64, 64, 79)
-    # a pixel is covered if its middle is
-    focal = width / 2 / np.tan(np.radians(hfov) / 2)
-    ray = np.abs((np.arange(64) + 0.5 - 32) / CAMERA.focal_px)
-    covered = (ray[:, None] <= height / 2 / focal + 1e-9) & (ray <= width / 2 / focal + 1e-9)
-    np.testing.assert_array_equal(view.covered, covered)
-    photograph = view.photograph(scene_of_rays(width, height, hfov))
-    rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
-    clipped = np.ix_(np.clip(range(64), rows[0], rows[-1]), np.clip(range(64), columns[0], columns[-1]))
-    assert photograph.dtype == np.float32
-    np.testing.assert_array_equal(photograph, photograph[clipped])  # extended with the colours at the border
-    # the border may be off by the larger pixel of the two cameras
-    slack = 0.3 * max(1 / CAMERA.focal_px, 1 / focal)
-    assert np.abs(photograph - expected)[covered].max() < slack
-    inner = covered & np.roll(covered, (1, 1), (0, 1)) & np.roll(covered, (-1, -1), (0, 1))
-    assert np.abs(photograph - expected)[inner].mean() < 0.1 * slack
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 5))
-def test_whole_factors_are_exact(seed, factor):
-    small = np.random.default_rng(seed).random((64, 64)) < 0.3
-    rgb = np.random.default_rng(seed).random((64, 64, 3)).astype(np.float32)
-    large, large_rgb = (np.repeat(np.repeat(image, factor, 0), factor, 1) for image in (small, rgb))
-    view = PinholeView(large.shape, 79, CAMERA)
-    np.testing.assert_array_equal(view.mask(large), small)
-    np.testing.assert_allclose(view.photograph(large_rgb), rgb, atol=1e-5)
-
-
-@given(st.integers(0, 630), st.booleans())
-def test_lines_of_half_a_pixel_are_kept_whole_and_thinner_ones_in_part(left, upright):
-    view = PinholeView((640, 640), 79, CAMERA)
-    for width, min_px in ((5, 64), (1, 1)):
-        image = np.zeros((640, 640), bool)
-        image[:, left : left + width] = True
-        found = view.mask(image if upright else image.T)
-        assert found.sum() >= min_px and (found if upright else found.T).all(axis=0).any()
-    assert not view.mask(np.zeros((640, 640), bool)).any()
-
-
-def test_edges_grow_by_a_quarter_of_a_pixel():
-    view = PinholeView((640, 640), 79, CAMERA)
-    grown = []
-    for left in range(200, 210):
-        image = np.zeros((640, 640), bool)
-        image[:, left:500] = True
-        grown.append(view.mask(image)[0].sum() * 10 - image[0].sum())
-    assert 1 < np.mean(grown) < 4  # tenths of a pixel
-
-
-@pytest.mark.parametrize("hfov", [0, 180, -3, float("nan"), 0.1])
-def test_impossible_fields_of_view_are_refused(hfov):
-    with pytest.raises(InputError, match=r"hfov_deg: expected"):
-        PinholeView((48, 48), hfov, CAMERA)
 
 
 # --- boxes --------------------------------------------------------------------------------------------------------

@@ -167,7 +167,9 @@ def test_values_are_projected_level_by_level(rgb):
 
 
 def test_parts_outside_a_narrow_photograph_are_outside_the_field_of_view(rgb):
-    full, narrow = (flat(2.0).project(rgb, np.ones((SIDE, SIDE), bool), hfov_deg=hfov) for hfov in (79, 40))
+    full, narrow = (
+        flat(2.0).project(rgb, np.ones((SIDE, SIDE), bool), camera=zerobev.Camera(hfov)) for hfov in (79, 40)
+    )
     for bev, hfov in ((full, 79), (narrow, 40)):
         half_m = 2 * np.tan(np.radians(hfov / 2))
         assert bev.maps.any() and bev.maps.sum() == pytest.approx(2 * half_m / 0.125, abs=2)
@@ -233,15 +235,68 @@ class Coarse:
         return rgb.mean(dim=1, keepdim=True) * self.factor
 
 
-@pytest.mark.parametrize(("side", "hfov", "seen"), [(1000, 79, 256), (150, 79, 150), (64, 79, 64), (40, 79, 64)])
-def test_the_input_of_an_estimator_has_its_size_up_to_the_photograph_s(side, hfov, seen):
+@pytest.mark.parametrize(("side", "seen"), [(1000, 256), (150, 150), (64, 64), (40, 64)])
+def test_the_input_of_an_estimator_has_its_size_up_to_the_photograph_s(side, seen):
     estimator = Coarse()
     row, column = np.mgrid[:side, :side] / side
     photograph = np.stack([0.2 + 0.3 * row, 0.2 + 0.3 * column, 0.4 + 0 * row], axis=-1)
-    depth = zerobev.Projector("a.2", CAMERA, None, estimator).depth(photograph, hfov)
+    depth = zerobev.Projector("a.2", CAMERA, None, estimator).depth(photograph)
     assert estimator.seen[0].shape == (1, 3, seen, seen)
     grid = (np.mgrid[:SIDE, :SIDE] + 0.5) / SIDE
     np.testing.assert_allclose(depth, (0.8 + 0.3 * grid.sum(axis=0)) / 3 * 5, atol=0.02)
+
+
+# --- depth of a sensor --------------------------------------------------------------------------------------------
+
+
+def test_measured_depth_replaces_the_estimate_and_scales_it_where_it_is_missing():
+    """The estimate is 2 m everywhere. A sensor measures 3 m in the left half; the rest is then 2 m * 3 / 2."""
+    measured = np.full((SIDE, SIDE), np.nan, np.float32)
+    measured[:, : SIDE // 2] = 3.0
+    measured[:8] = 0.0
+    rgb = np.zeros((SIDE, SIDE, 3), np.uint8)
+    model = flat(2.0)
+    np.testing.assert_allclose(model.depth(rgb), 2.0)
+    np.testing.assert_allclose(model.depth(rgb, depth=measured), 3.0, rtol=1e-6)
+    few = np.zeros((SIDE, SIDE), np.float32)
+    few[0, :5] = 3.0  # too few values for a scale
+    np.testing.assert_allclose(model.depth(rgb, depth=few), np.where(few > 0, 3.0, 2.0))
+
+
+def test_the_map_follows_measured_depth(models, rgb):
+    """A wall at 1.5 m or at 4 m: P^-1 marks the row of cells at its depth."""
+    mask = np.ones((SIDE, SIDE), bool)
+    for metres in (1.5, 4.0):
+        bev = models["a.2"].project(rgb, mask, depth=np.full((SIDE, SIDE), metres))
+        rows = np.flatnonzero(bev.maps[0].any(axis=1))
+        assert rows.tolist() == [CAMERA.bev_px - 1 - int(metres / CAMERA.cell_m)]
+    near, far = (models["d"].project(rgb, mask, depth=np.full((SIDE, SIDE), z)).values for z in (1.5, 4.0))
+    assert np.abs(near - far).max() > 0.1  # the residual network reads it
+
+
+def test_a_limit_on_heights_follows_the_camera_s_height():
+    """A wall 2 m away, seen from 0.3 m and 1.8 m: pixels below 2 m above the floor count, others do not."""
+    for height in (0.3, 0.88, 1.8):
+        rows = (np.arange(SIDE) + 0.5 - SIDE / 2) / CAMERA.focal_px * 2.0  # metres below the pinhole
+        for mask, expected in ((height - rows < 1.99, True), (height - rows > 2.01, False)):
+            image = np.repeat(mask[:, None], SIDE, axis=1)
+            bev = flat(2.0).project(np.zeros((SIDE, SIDE, 3), np.uint8), image, zerobev.Camera(height_m=height))
+            assert bev.maps.any() == (expected and image.any())
+
+
+@pytest.mark.parametrize(
+    ("depth", "message"),
+    [
+        (np.ones((3, 3)), r"expected the photograph's size \(64, 64\), found \(3, 3\)"),
+        (np.full((SIDE, SIDE), 2000, np.uint16), "expected floating point, metres, found uint16; millimetres"),
+        (np.full((SIDE, SIDE), 2000.0), "expected metres, found a median of 2000: millimetres?"),
+        (np.full((SIDE, SIDE), -1.0), "found infinity or less than 0"),
+        (np.full((SIDE, SIDE), np.inf), "found infinity or less than 0"),
+    ],
+)
+def test_depth_of_a_sensor_is_checked(depth, message, rgb):
+    with pytest.raises(InputError, match=f"depth: .*{message}"):
+        flat(2.0).project(rgb, np.ones((SIDE, SIDE), bool), depth=depth)
 
 
 @pytest.mark.parametrize(
@@ -264,7 +319,7 @@ def test_a_network_on_another_device_is_refused():
 
 
 def test_depth_is_zero_outside_the_photograph(models, rgb):
-    depth = models["a.2"].depth(rgb, hfov_deg=40)
+    depth = models["a.2"].depth(rgb, zerobev.Camera(40))
     assert depth.shape == (SIDE, SIDE) and depth[SIDE // 2, SIDE // 2] > 0 and not depth[0].any()
 
 
@@ -310,7 +365,7 @@ def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, c
     for path, mask in ((floor, masks[0]), (thing, masks[1])):
         Image.fromarray(mask.astype(np.uint8)).save(path)
     command(photo, "--masks", floor, thing, "--hfov", 85, "--out", out, "--row", ROWS[0])
-    expected = models[ROWS[0]].project(rgb, masks[:2], hfov_deg=85)
+    expected = models[ROWS[0]].project(rgb, masks[:2], camera=zerobev.Camera(85))
     with np.load(out.with_suffix(".npz")) as file:
         np.testing.assert_allclose(file["values"], expected.values, atol=1e-4)
         assert file["labels"].tolist() == ["floor", "thing"]

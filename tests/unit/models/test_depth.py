@@ -32,6 +32,7 @@ from zerobev.common.errors import InputError
 from zerobev.config import SCALES, TrainConfig
 from zerobev.data.samples import ViewSet, as_float
 from zerobev.data.views import View
+from zerobev.geometry.cameras import Camera
 from zerobev.inference import Projector
 from zerobev.inference.pinhole import PinholeView
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
@@ -375,6 +376,23 @@ def test_metric_types_predict_metres_up_to_the_maximum_of_their_configuration(ma
     assert depth.min() > 0 and depth.max() <= farthest_m
 
 
+def test_depth_is_at_most_that_of_the_floor():
+    """With `floor_depth`, rows below the horizon end at the floor, whatever the weights; rows above are free."""
+    model = replace(SMOKE.model, floor_depth=True)
+    network = DepthNet(SMOKE.camera, model).eval()
+    side, camera = SMOKE.camera.fpv_px, SMOKE.camera
+    slope = (np.arange(side) + 0.5 - side / 2) / camera.focal_px
+    floor = np.minimum(camera.height_m / np.maximum(slope, 1e-9), FARTHEST_M)
+    with torch.no_grad():
+        for bias in (-30.0, 0.0, 5.0):
+            network.head.bias.fill_(bias)
+            depth = network(torch.rand(1, 3, side, side))[0, 0].numpy()
+            assert (depth <= floor[:, None] * (1 + 1e-5)).all()
+            if bias == -30.0:
+                np.testing.assert_allclose(depth, np.repeat(floor[:, None], side, axis=1), rtol=1e-4)
+        assert (DepthNet(SMOKE.camera, SMOKE.model).least == 1 / FARTHEST_M).all()
+
+
 def test_a_projector_resamples_the_photograph_to_the_size_of_the_model():
     estimator = HubDepth(depth_anything())
     seen = seen_by(estimator)
@@ -382,7 +400,7 @@ def test_a_projector_resamples_the_photograph_to_the_size_of_the_model():
     photograph = np.random.default_rng(0).random((500, 500, 3))
     depth = Projector("a.2", SMOKE.camera, None, estimator.eval()).depth(photograph)
     assert depth.shape == (32, 32)
-    expected = torch.from_numpy(PinholeView((500, 500), 79, fine).photograph(photograph)).permute(2, 0, 1)
+    expected = torch.from_numpy(PinholeView((500, 500), Camera(), fine).photograph(photograph)).permute(2, 0, 1)
     torch.testing.assert_close(seen[0][0] * estimator.std + estimator.mean, expected)
 
 

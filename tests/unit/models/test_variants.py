@@ -266,6 +266,22 @@ def test_the_residual_is_an_embedding_of_the_projection_added_to_the_map_feature
     assert torch.allclose(seen[0], features + weight * known + bias, atol=1e-5)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("row", ["d", "f.r"])
+def test_a_residual_network_may_know_which_cells_depth_shows(row):
+    """Without depth, P^-1 of a white image and of a black one are both empty; the cells seen tell the two apart."""
+    model = replace(SMOKE.model, seen=True)
+    net = build(row, SMOKE.camera, model).eval()
+    seen = []
+    net.decoder.register_forward_pre_hook(lambda _, features: seen.append(features[0]))
+    rgb, black = torch.rand(1, 3, 32, 32), torch.zeros(1, 1, 32, 32)
+    for depth in (torch.zeros(1, 1, 32, 32), torch.full((1, 1, 32, 32), 2.0)):
+        net(rgb, black, depth)
+    cells = inverse_project(torch.ones_like(black), torch.full((1, 1, 32, 32), 2.0), net.camera)[:, 0]
+    changed = (seen[0] != seen[1]).any(dim=1)
+    assert cells.any() and torch.equal(changed, cells > 0)
+
+
 # --- inductive bias
 
 
