@@ -49,7 +49,7 @@ def measure_steps(machine: Machine, name: str, samples: int) -> dict[str, Any]:
             torch.cuda.reset_peak_memory_stats()
             runs[row]()
             memory[row] = torch.cuda.max_memory_allocated() / 1e9
-    return against_the_machine(runs, {}, machine, _REPEATS) | {"samples": samples, "memory_gb": memory}
+    return against_the_machine(runs, machine, _REPEATS) | {"samples": samples, "memory_gb": memory}
 
 
 def measure_compiled(machine: Machine) -> dict[str, Any]:

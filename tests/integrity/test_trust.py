@@ -103,6 +103,18 @@ def test_the_readme_holds_the_numbers_of_the_gpu():
     assert f"{step['samples']} samples: {milliseconds:.0f} ms and {memory:.1f} GB" in (ROOT / "README.md").read_text()
 
 
+def test_the_comparison_with_other_code_says_how_it_was_made():
+    peers = json.loads((ROOT / "reports/peers.json").read_text())
+    assert set(peers) == {"date", "how", "sizes", "rows"} and re.fullmatch(r"\d{4}-\d{2}", peers["date"])
+    assert peers["how"] and peers["sizes"] and peers["rows"]
+    for row in peers["rows"]:
+        assert set(row) - {"parameters_m"} == {"network", "measured", "precision", "batch", "low", "high"}
+        assert all(row[name] for name in ("network", "measured", "precision", "batch"))
+        assert 0 < row["low"] <= row["high"] and row.get("parameters_m", 1) > 0
+    named = [(row["network"], row["measured"], row["precision"], row["batch"]) for row in peers["rows"]]
+    assert len(set(named)) == len(named)
+
+
 def test_published_numbers_are_unchanged():
     numbers = {
         number: {name: [*row.per_class, row.class_iou, row.pixel_iou] for name, row in rows.items()}

@@ -87,9 +87,7 @@ def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> di
     needs one per scene, a fresh texture per pair needs one per pair.
     """
     torch.set_num_threads(1)
-    scene, source = _views(folder, setting)
-    write_shard(shard, scene, (source.draw() for _ in range(_STORED)), setting.camera, setting.texture, 0)
-    views = ViewSet([Shard(shard, setting.camera, setting.texture)])
+    views, scene = stored_views(folder, shard, setting, _STORED), read_scene(folder)
     stored = [views.locate(index)[1] for index in range(len(views))]
     banks = {f"synth {white:g}": noise_bank(setting, white) for white in DENSITIES}
     streams: dict[str, SampleStream] = {
@@ -121,6 +119,19 @@ def measure_pairs(folder: Path, shard: Path, setting: Scale, repeats: int) -> di
         "ratio": spread(render_s / look_up_s),
         "tuples": spread(samples),
     }
+
+
+def stored_views(folder: Path, shard: Path, setting: Scale, count: int) -> ViewSet:
+    """Views of a home, written to `shard`."""
+    scene, source = _views(folder, setting)
+    write_shard(shard, scene, (source.draw() for _ in range(count)), setting.camera, setting.texture, 0)
+    return ViewSet([Shard(shard, setting.camera, setting.texture)])
+
+
+def synth_stream(views: ViewSet, setting: Scale, samples: int) -> SynthSamples:
+    """Training data of a scale in batches of `samples`, with textures of `noise_bank`."""
+    bank, empty = noise_bank(setting, setting.texture.white_fraction), setting.empty_fraction
+    return SynthSamples(views, bank, setting.camera, 0, samples, empty, extruded_fraction=setting.extruded_fraction)
 
 
 def noise_bank(setting: Scale, white_fraction: float) -> TextureBank:

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from zerobev.benchmarks.data import home_folder, noise_bank, view_rates
+from zerobev.benchmarks.data import home_folder, synth_stream, view_rates
 from zerobev.common.errors import InputError
 from zerobev.config import SPLITS, Scale
 from zerobev.data.generate import shard_path
-from zerobev.data.samples import SynthSamples, ViewSet, as_float, collate, semantic_sample
+from zerobev.data.samples import ViewSet, as_float, collate, semantic_sample
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.views import ViewSource
 from zerobev.experiments.depth_pretraining import DepthPretraining
@@ -161,13 +161,8 @@ def measure(scale: Scale, home: Path | None) -> dict[str, Any]:
         source = ViewSource(scene, scale.camera, scale.texture, np.random.default_rng(0))
         drawn = [source.draw() for _ in range(_VIEWS)]
         stored_s = _seconds(lambda: write_shard(path, scene, drawn, scale.camera, scale.texture, 0)) / _VIEWS
-        views, bank = (
-            ViewSet([Shard(path, scale.camera, scale.texture)]),
-            noise_bank(scale, scale.texture.white_fraction),
-        )
-        synth = SynthSamples(
-            views, bank, scale.camera, 0, samples, scale.empty_fraction, extruded_fraction=scale.extruded_fraction
-        )
+        views = ViewSet([Shard(path, scale.camera, scale.texture)])
+        synth = synth_stream(views, scale, samples)
         depth, test = DepthSamples(views, 0, samples), as_float(collate([semantic_sample(views, 0, scale.camera)]))
         network, estimator = build("c", scale.camera, scale.model), DepthNet(scale.camera, scale.model)
         return {

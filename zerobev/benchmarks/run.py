@@ -7,7 +7,7 @@ machine and time; ratios carry over: to the machine's peak of matrix products, a
 
 import argparse
 import itertools
-from collections.abc import Iterator
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -19,7 +19,18 @@ import torch
 from torch import Tensor
 
 from zerobev.benchmarks import data as generation
-from zerobev.benchmarks.training import Machine, Run, measure_paper_step, measure_training, training_step
+from zerobev.benchmarks.throughput import measure_throughput
+from zerobev.benchmarks.training import (
+    Machine,
+    Run,
+    draw,
+    few,
+    measure_drawing,
+    measure_paper_step,
+    measure_training,
+    training_step,
+)
+from zerobev.common.memory import keep_freed_memory
 from zerobev.common.storage import write_json
 from zerobev.config import SCALES, Scale, scale
 from zerobev.data.samples import SynthSamples
@@ -30,34 +41,56 @@ from zerobev.experiments.workspace import Workspace
 from zerobev.models import BevModel, build
 
 MODALITIES = (1, 8, 40)  #: zero-shot images per RGB image
-ROWS = ("c", "e", "f")  #: of which inference is measured
-REPEATS = 9  #: of the recorded benchmark
+ROWS = ("c", "d", "e", "f", "f.r")  #: of which inference is measured
+PAPER_ROWS = ("c", "e", "f")  #: the same at the paper's sizes
+REPEATS = 5  #: of the recorded benchmark
+_LARGE_PX = 128  # of the images of larger cameras
 _SIZES = (0.5, 1.0, 2.0)  # of images and of maps, relative to the scale's
 _SCENES = (1, 4)
 
 
-def measure_inference(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
-    """Milliseconds of the networks `ROWS` for K zero-shot images of one RGB image, in one call and in K calls."""
+def measure_inference(
+    setting: Scale, rows: Sequence[str], modalities: Sequence[int], machine: Machine, repeats: int
+) -> dict[str, Any]:
+    """Milliseconds of one call for K zero-shot images of one RGB image, per row and precision.
+
+    `ratio`: relative to one image in the same precision.
+    """
+    precisions = ("float32", "bfloat16") if machine.bfloat16 else ("float32",)
     measured = {}
-    for row in ROWS:
+    for row in rows:
         net = build(row, setting.camera, setting.model).to(machine.device).eval()
-        runs: dict[str, Run] = {}
-        for k in MODALITIES:
-            batch = machine.batch(setting.camera, 1, k)
-            rgb, images = batch["rgb"], batch["zero"]
-            runs[f"shared {k}"] = partial(net, rgb, images)
-            runs[f"separate {k}"] = partial(_one_by_one, net, rgb, images)
-        with torch.inference_mode():
-            found = machine.milliseconds(runs, repeats)
-        one = found["shared 1"]["median"]
+        batches = {k: machine.batch(setting.camera, 1, k) for k in modalities}
+        runs: dict[tuple[str, int], Run] = {
+            (precision, k): partial(_project, net, [batch], machine.autocast(precision == "bfloat16"))
+            for precision, (k, batch) in itertools.product(precisions, batches.items())
+        }
+        found = machine.milliseconds(runs, repeats)
         measured[row] = {
-            "milliseconds": found,
-            "k8_over_k1": found["shared 8"]["median"] / one,
-            "shared_over_separate": {
-                str(k): found[f"shared {k}"]["median"] / found[f"separate {k}"]["median"] for k in MODALITIES
-            },
+            precision: {
+                str(k): found[precision, k] | {"ratio": found[precision, k]["median"] / found[precision, 1]["median"]}
+                for k in modalities
+            }
+            for precision in precisions
         }
     return measured
+
+
+def measure_calls(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
+    """Milliseconds of (c) for K zero-shot images of one RGB image, in one call and in K calls; `ratio`: of the two."""
+    net = build("c", setting.camera, setting.model).to(machine.device).eval()
+    runs: dict[tuple[str, int], Run] = {}
+    for k in MODALITIES:
+        batch = machine.batch(setting.camera, 1, k)
+        singles = [batch | {"zero": image} for image in batch["zero"].split(1, dim=1)]
+        for how, calls in (("one call", [batch]), ("K calls", singles)):
+            runs[how, k] = partial(_project, net, calls, machine.autocast(False))
+    found = machine.milliseconds(runs, repeats)
+    return {
+        str(k): {how: found[how, k] for how in ("one call", "K calls")}
+        | {"ratio": found["one call", k]["median"] / found["K calls", k]["median"]}
+        for k in MODALITIES
+    }
 
 
 def measure_sizes(setting: Scale, machine: Machine, repeats: int) -> dict[str, dict[str, Any]]:
@@ -76,7 +109,7 @@ def measure_sizes(setting: Scale, machine: Machine, repeats: int) -> dict[str, d
     for scenes in _SCENES:
         views = workspace.views("train", scenes)
         stream = SynthSamples(views, workspace.bank(), camera, 0, setting.train.batch)
-        runs[f"scenes {scenes}"] = partial(_next_batch, stream, itertools.count())
+        runs[f"scenes {scenes}"] = partial(draw, stream, itertools.count(), machine)
     found = machine.milliseconds(runs, repeats)
     base = {"image": "image 1x", "map": "map 1x", "scenes": f"scenes {_SCENES[0]}"}
     return {
@@ -94,6 +127,7 @@ def measure_memory(setting: Scale) -> dict[str, float]:
 def _peak_of(part: str, name: str) -> float:
     setting, machine = scale(name), Machine()
     if part == "training":
+        keep_freed_memory()
         net = build("c", setting.camera, setting.model).to(machine.device)
         step = training_step(net, machine.batch(setting.camera, setting.train.batch), machine)
         for _ in range(5):
@@ -111,33 +145,41 @@ def _peak_of(part: str, name: str) -> float:
     return peak_memory_mb()
 
 
-def _one_by_one(net: BevModel, rgb: Tensor, images: Tensor) -> None:
-    for image in images.split(1, dim=1):
-        net(rgb, image)
-
-
-def _next_batch(stream: SynthSamples, steps: Iterator[int]) -> None:
-    stream.batch(next(steps))
+@torch.inference_mode()
+def _project(net: BevModel, batches: Sequence[dict[str, Tensor]], autocast: torch.autocast) -> None:
+    with autocast:
+        for batch in batches:
+            net(batch["rgb"], batch["zero"], batch["depth"])
 
 
 def measure(setting: Scale, repeats: int) -> dict[str, Any]:
     """All measurements, as plain data."""
     machine = Machine()
-    training = measure_training(setting, machine, repeats)
-    paper = measure_paper_step(machine, max(repeats // 3, 1))
-    inference = measure_inference(setting, machine, repeats)
+    large = replace(setting, camera=replace(setting.camera, fpv_px=_LARGE_PX))
+    inference = {
+        name: measure_inference(of, rows, modalities, machine, turns)
+        for name, of, rows, modalities, turns in (
+            (f"{setting.name}, {setting.camera.fpv_px} px", setting, ROWS, MODALITIES, repeats),
+            (f"{setting.name}, {_LARGE_PX} px", large, ROWS, MODALITIES, few(repeats)),
+            ("paper", scale("paper"), PAPER_ROWS, MODALITIES[:2], 1),
+        )
+    }
+    calls = measure_calls(setting, machine, repeats)
+    keep_freed_memory()  # as in training
     return {
         "scale": setting.name,
         "device": machine.device.type,
         "threads": torch.get_num_threads(),
         "repeats": repeats,
-        "k8_over_k1": inference["c"]["k8_over_k1"],
-        "generation": generation.measure(setting, repeats, seconds=1.0),
-        "training": training,
-        "paper_step": paper,
+        "training": measure_training(setting, machine, repeats),
+        "paper_step": measure_paper_step(machine, few(repeats)),
+        "drawing": measure_drawing(machine, repeats),
+        "throughput": measure_throughput(setting, machine, repeats),
         "inference": inference,
+        "calls": calls,
         "sizes": measure_sizes(setting, machine, repeats),
         "memory_mb": measure_memory(setting),
+        "generation": generation.measure(setting, repeats, seconds=1.0),  # last: it leaves torch with one thread
     }
 
 
@@ -152,11 +194,23 @@ def table(measured: dict[str, Any]) -> list[str]:
             if name in found["share_of_peak"]:
                 peak, roofline = (100 * found[key][name] for key in ("share_of_peak", "share_of_roofline"))
                 lines[-1] += f"  {peak:5.1f} % of the peak, {roofline:5.1f} % of the roofline"
-    for workers, waiting in training["waiting_share"].items():
-        lines.append(f"{f'waiting for data, workers: {workers}':<34}{100 * waiting['share']:>9.1f} %")
-    for row, found in measured["inference"].items():
-        ratios = ", ".join(f"{k}: {ratio:.2f}" for k, ratio in found["shared_over_separate"].items())
-        lines.append(f"inference ({row}): 8 images take {found['k8_over_k1']:.2f} x one; one call / K calls {ratios}")
+    for name, drawn in measured["drawing"].items():
+        lines.append(f"{f'drawing at {name}, of a step':<34}{100 * drawn['share']:>9.1f} %")
+    for row, found in measured["throughput"]["rows"].items():
+        lines += [
+            f"{f'step ({row}), {name}':<34}{ms['median']:>9.1f}  {ms['ratio']:.2f} x" for name, ms in found.items()
+        ]
+    for name, ms in measured["throughput"]["busy"].items():
+        lines.append(f"{f'beside busy loops, {name}':<34}{ms['median']:>9.1f}  {ms['ratio']:.2f} x")
+    for sizes, rows in measured["inference"].items():
+        for row, precision in ((row, precision) for row, found in rows.items() for precision in found):
+            found = rows[row][precision]
+            ratios = ", ".join(f"{k}: {ms['ratio']:.2f}" for k, ms in found.items())
+            lines.append(
+                f"{f'inference ({row}), {sizes}':<34}{found['1']['median']:>9.1f}  {precision}, x for K {ratios}"
+            )
+    for k, found in measured["calls"].items():
+        lines.append(f"{f'one call against {k} calls':<34}{found['ratio']:>9.2f} x")
     lines += [f"{name:<34}{one['ratio']:>9.2f} x" for name, one in measured["sizes"].items()]
     return lines + [f"memory, {name:<26}{peak:>9.0f} MB" for name, peak in measured["memory_mb"].items()]
 

@@ -6,10 +6,12 @@ bytes at the rate of a large copy.
 """
 
 import itertools
+import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,23 +19,21 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode, flop_registry
 
-from zerobev.benchmarks.data import spread
-from zerobev.config import CameraConfig, Scale, scale
-from zerobev.data.samples import SynthSamples
-from zerobev.experiments.workspace import Workspace
+from zerobev.benchmarks.data import home_folder, spread, stored_views, synth_stream
+from zerobev.config import SCALES, CameraConfig, Scale, scale
 from zerobev.models import BevModel, ZeroBEV, build
-from zerobev.training.loader import Source, batches
+from zerobev.training.loader import Source, moved
 from zerobev.training.losses import zero_bev_loss
 from zerobev.training.precision import computes_bfloat16
 
 _MATMUL = 2048  # side of the matrices in the product that gives the peak
 _COPIED = 2**24  # float32 numbers in the copy that gives the bandwidth
-_WAITED = 20  # steps in which waiting for data is measured
 _PAPER_SAMPLES = 2  # of a step at the paper's sizes; 16 exceed the memory of a laptop
 #: Operations that reserve memory without access.
 _RESERVING = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided")
 
 Run = Callable[[], Any]
+Name = TypeVar("Name", bound=Hashable)
 
 
 class Machine:
@@ -43,13 +43,13 @@ class Machine:
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.bfloat16 = computes_bfloat16(self.device.type)
 
-    def autocast(self) -> torch.autocast:
-        """Autocast as in training."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
+    def autocast(self, enabled: bool = True) -> torch.autocast:
+        """Autocast to bfloat16, as in training; never where the device does not compute in it."""
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=enabled and self.bfloat16)
 
-    def milliseconds(self, runs: dict[str, Run], repeats: int) -> dict[str, dict[str, float]]:
+    def milliseconds(self, runs: Mapping[Name, Run], repeats: int) -> dict[Name, dict[str, float]]:
         """Spread of the time per run; interleaved, so that machine noise hits all alike."""
-        times: dict[str, list[float]] = {name: [] for name in runs}
+        times: dict[Name, list[float]] = {name: [] for name in runs}
         for repeat in range(repeats + 1):  # the first is a warm-up
             for name, run in runs.items():
                 start = time.perf_counter()
@@ -161,19 +161,15 @@ def min_milliseconds(run: Run, peak_tflops: float, bandwidth_gbs: float) -> floa
 
 
 def measure_training(setting: Scale, machine: Machine, repeats: int) -> dict[str, Any]:
-    """Time of a step of (c), of its blocks and of drawing its batch, with the fractions of peak and roofline.
+    """Time of a step of (c) and of its blocks, with the fractions of peak and roofline.
 
     The peak is the rate of a product of 2048 x 2048 matrices, in bfloat16 if training uses it.
     """
     net = build("c", setting.camera, setting.model).to(machine.device)
     assert isinstance(net, ZeroBEV)  # as row (c) is
     batch = machine.batch(setting.camera, setting.train.batch)
-    stream, step = _stream(setting), training_step(net, batch, machine)
-    numbers = itertools.count()
-    drawing = {"batch": lambda: stream.batch(next(numbers))}
-    measured = against_the_machine({"step": step} | blocks(net, batch, machine), drawing, machine, repeats)
-    waiting = {str(workers): waiting_fraction(net, stream, machine, workers) for workers in (0, 1)}
-    return measured | {"waiting_share": waiting}
+    runs = {"step": training_step(net, batch, machine)} | blocks(net, batch, machine)
+    return against_the_machine(runs, machine, repeats)
 
 
 def measure_paper_step(machine: Machine, repeats: int) -> dict[str, Any]:
@@ -188,7 +184,7 @@ def measure_paper_step(machine: Machine, repeats: int) -> dict[str, Any]:
         "step": partial(_with_dropout, step, net, 0.0),
         "with dropout": partial(_with_dropout, step, net, paper.model.dropout),
     }
-    return against_the_machine(steps, {}, machine, repeats)
+    return against_the_machine(steps, machine, repeats)
 
 
 def _with_dropout(step: Run, net: BevModel, probability: float) -> None:
@@ -198,8 +194,8 @@ def _with_dropout(step: Run, net: BevModel, probability: float) -> None:
     step()
 
 
-def against_the_machine(runs: dict[str, Run], others: dict[str, Run], machine: Machine, repeats: int) -> dict[str, Any]:
-    """Time of `runs` and `others`, interleaved with a matrix product and a copy; for `runs`, fractions of these bounds.
+def against_the_machine(runs: dict[str, Run], machine: Machine, repeats: int) -> dict[str, Any]:
+    """Time of `runs`, interleaved with a matrix product and a copy, and its fractions of these bounds.
 
     Returns `milliseconds` with their spread, `gigaflops`, the bounds, and per run: `share_of_peak`, the same on the
     roofline (`roofline_share_of_peak`), and `share_of_roofline`.
@@ -208,7 +204,7 @@ def against_the_machine(runs: dict[str, Run], others: dict[str, Run], machine: M
     matrix = matrix.bfloat16() if machine.bfloat16 else matrix
     source, target = torch.rand(2, _COPIED, device=machine.device)
     rates: dict[str, Run] = {"matrix product": lambda: matrix @ matrix, "copy": lambda: target.copy_(source)}
-    milliseconds = machine.milliseconds(rates | runs | others, repeats)
+    milliseconds = machine.milliseconds(rates | runs, repeats)
     # medians: on a shared machine, single products can be three times as fast, whole steps cannot
     peak, best = (2 * _MATMUL**3 / milliseconds["matrix product"][of] / 1e9 for of in ("median", "low"))
     bandwidth = 2 * 4 * _COPIED / milliseconds["copy"]["median"] / 1e6
@@ -226,28 +222,36 @@ def against_the_machine(runs: dict[str, Run], others: dict[str, Run], machine: M
     }
 
 
-def waiting_fraction(net: BevModel, stream: Source, machine: Machine, workers: int) -> dict[str, float]:
-    """Fraction of training time spent waiting for batches (`share`), and `milliseconds` per step with waiting."""
-    drawn = batches(stream, range(_WAITED + 1), machine.device, workers=workers)
-    batch = dict(next(drawn))  # after the start of the workers
-    step = training_step(net, batch, machine)
-    waited, ended = 0.0, time.perf_counter()
-    started = ended
-    for new in drawn:
-        waited += time.perf_counter() - ended
-        batch.update(new)
-        step()
-        machine.finish()
-        ended = time.perf_counter()
-    return {"share": waited / (ended - started), "milliseconds": 1e3 * (ended - started) / _WAITED}
+def few(repeats: int) -> int:
+    """Number of repeats at the paper's sizes, where one takes seconds."""
+    return max(repeats // 3, 1)
 
 
-def _stream(setting: Scale) -> SynthSamples:
-    workspace = Workspace(setting.name)
-    samples = (setting.camera, 0, setting.train.batch, setting.empty_fraction)
-    return SynthSamples(
-        workspace.views("train", 1), workspace.bank(), *samples, extruded_fraction=setting.extruded_fraction
-    )
+def draw(stream: Source, steps: Iterator[int], machine: Machine) -> None:
+    """Draw the batch of the next step, up to the device."""
+    moved(stream.batch(next(steps)), machine.device)
+
+
+def measure_drawing(machine: Machine, repeats: int) -> dict[str, Any]:
+    """Time of drawing a batch, in the process and up to the device, and of a step of (c), at every scale.
+
+    Views of one generated home; `share` is the fraction of drawing in the sum of both.
+    """
+    measured = {}
+    with tempfile.TemporaryDirectory() as folder:
+        home = home_folder(Path(folder), 0)
+        for name, setting in SCALES.items():
+            samples, turns = (_PAPER_SAMPLES, few(repeats)) if name == "paper" else (setting.train.batch, repeats)
+            views = stored_views(home, Path(folder) / f"{name}.h5", setting, setting.train.batch)
+            net = build("c", setting.camera, setting.model).to(machine.device)
+            runs: dict[str, Run] = {
+                "batch": partial(draw, synth_stream(views, setting, samples), itertools.count(), machine),
+                "step": training_step(net, machine.batch(setting.camera, samples), machine),
+            }
+            found = machine.milliseconds(runs, turns)
+            batch, step = (found[part]["median"] for part in ("batch", "step"))
+            measured[name] = {"samples": samples, "milliseconds": found, "share": batch / (batch + step)}
+    return measured
 
 
 def _leaves(maps: Iterable[Tensor]) -> list[Tensor]:

@@ -3,4 +3,4 @@
 DATA = 2  #: homes, views, textures
 RECIPE = 4  #: training and evaluation of a run
 DEPTH = 1  #: training of the depth estimator
-BENCHMARK = 4  #: measurements of the benchmark
+BENCHMARK = 5  #: measurements of the benchmark

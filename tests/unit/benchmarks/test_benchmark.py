@@ -6,8 +6,8 @@ from torch import nn
 
 from zerobev.benchmarks import run as benchmark
 from zerobev.benchmarks import training
-from zerobev.benchmarks.run import ROWS, measure_inference
-from zerobev.benchmarks.training import Machine, blocks, flops, min_milliseconds, training_step, waiting_fraction
+from zerobev.benchmarks.run import measure_calls, measure_inference
+from zerobev.benchmarks.training import Machine, blocks, flops, measure_drawing, min_milliseconds, training_step
 from zerobev.config import SCALES
 from zerobev.models import build
 
@@ -59,12 +59,16 @@ def test_a_roofline_of_products_alone_is_their_number():
     assert min_milliseconds(step, 1, 1) > min_milliseconds(step, 1, 10) > flops(step) / 1e9
 
 
-def test_waiting_is_the_time_between_steps(monkeypatch):
-    clock = [0.0]
+def test_the_share_of_drawing_is_that_of_its_sum_with_a_step(monkeypatch):
+    clock, drawn = [0.0], []
 
     class Slow:
+        def __init__(self, views, setting, samples):
+            self.samples = samples
+
         def batch(self, step, rank=0, world_size=1):
             clock[0] += 3
+            drawn.append((self.samples, step))
             return Machine().batch(SMOKE.camera, 2)
 
     def counted(net, batch, machine):
@@ -73,9 +77,15 @@ def test_waiting_is_the_time_between_steps(monkeypatch):
 
         return step
 
-    monkeypatch.setattr(training.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(training, "SCALES", {"smoke": SMOKE})
+    monkeypatch.setattr(training, "home_folder", lambda folder, number: folder)
+    monkeypatch.setattr(training, "stored_views", lambda *_: None)
+    monkeypatch.setattr(training, "synth_stream", Slow)
     monkeypatch.setattr(training, "training_step", counted)
-    assert waiting_fraction(None, Slow(), Machine(), workers=0) == {"share": 3 / 8, "milliseconds": 8000}
+    monkeypatch.setattr(training.time, "perf_counter", lambda: clock[0])
+    measured = measure_drawing(Machine(), repeats=2)["smoke"]
+    assert measured["share"] == 3 / 8 and measured["samples"] == SMOKE.train.batch
+    assert drawn == [(SMOKE.train.batch, step) for step in range(3)]  # another batch each time
 
 
 def test_runs_take_turns_and_the_first_turn_does_not_count(monkeypatch):
@@ -88,25 +98,29 @@ def test_runs_take_turns_and_the_first_turn_does_not_count(monkeypatch):
     assert found["b"] == {"median": 13e3, "low": 9e3, "high": 17e3}
 
 
-def test_one_call_and_separate_calls_get_the_same_images(monkeypatch):
-    seen = {"shared": [], "separate": []}
+def test_k_images_are_compared_with_one_in_the_same_precision(monkeypatch):
+    """A clock on which a call takes 2 + K in float32 and 1 + K in bfloat16."""
+    clock, rgb_px = [0.0], set()
 
-    def listen(row, camera, model):
-        net = build(row, camera, model)
-        net.register_forward_pre_hook(lambda _, inputs: seen[current[0]].append(inputs[1].shape[1]))
-        return net
+    class Network(nn.Module):
+        def forward(self, rgb, images, depth):
+            rgb_px.add(rgb.shape[-1])
+            assert images.shape[0] == 1 and depth is not None and not torch.is_grad_enabled()
+            clock[0] += images.shape[1] + 2 - torch.is_autocast_enabled("cpu")
 
-    current = ["shared"]
-
-    def once(self, runs, repeats):
-        for name, run in runs.items():
-            current[0] = name.split()[0]
-            run()
-        return {name: {"median": 1.0} for name in runs}
-
-    monkeypatch.setattr(benchmark, "build", listen)
-    monkeypatch.setattr(benchmark, "MODALITIES", (1, 8))
-    monkeypatch.setattr(Machine, "milliseconds", once)
-    measured = measure_inference(SMOKE, Machine(), repeats=1)
-    assert seen == {"shared": [1, 8] * len(ROWS), "separate": [1] * 9 * len(ROWS)}
-    assert measured["c"]["k8_over_k1"] == 1 and set(measured) == set(ROWS)
+    monkeypatch.setattr(benchmark, "build", lambda row, camera, model: Network())
+    monkeypatch.setattr(training.time, "perf_counter", lambda: clock[0])
+    machine = Machine()
+    machine.bfloat16 = True
+    measured = measure_inference(SMOKE, ("c", "f"), (1, 8), machine, repeats=2)
+    assert measured["c"] == measured["f"] and rgb_px == {SMOKE.camera.fpv_px}
+    ratios = {p: {k: ms["ratio"] for k, ms in found.items()} for p, found in measured["c"].items()}
+    assert ratios == {"float32": {"1": 1, "8": 10 / 3}, "bfloat16": {"1": 1, "8": 9 / 2}}
+    machine.bfloat16 = False  # emulated, which is slower
+    assert list(measure_inference(SMOKE, ("c",), (1,), machine, repeats=1)["c"]) == ["float32"]
+    # one call takes 2 + K, K calls take 3 K
+    assert {k: found["ratio"] for k, found in measure_calls(SMOKE, machine, 2).items()} == {
+        "1": 1,
+        "8": 10 / 24,
+        "40": 42 / 120,
+    }
