@@ -1,4 +1,4 @@
-"""All settings, as frozen dataclasses, and the three scales.
+"""All settings, as frozen dataclasses, and the scales.
 
 Code and notebooks are the same at every scale. Values that a scale does not set (field of view, map extent, alpha,
 batch of 16, ...) are the paper's.
@@ -122,7 +122,7 @@ class AugmentConfig:
     """Random changes of training samples (not in the paper); fractions of the samples."""
 
     looks: float = 0.0  #: with another look of the photograph, see `data.looks`
-    cameras: float = 0.0  #: as seen by a tilted camera, or one with another field of view, see `data.cameras`
+    cameras: float = 0.0  #: as seen by a tilted camera, or one with another field of view, see `data.coverage`
     mirrored: float = 0.0  #: mirrored left to right
 
 
@@ -218,6 +218,58 @@ class Scale:
     vpn_backbone: str = ""
 
 
+_REDUCED = Scale(
+    name="reduced",
+    camera=CameraConfig(fpv_px=64, bev_px=40),
+    scenes=SceneConfig(train=200, validation=4, test=32, views=80),
+    model=ModelConfig(
+        width=32,
+        block="basic",
+        depths=(1, 2, 2, 2),
+        channels=(16, 32, 64, 128),
+        stem_channels=16,
+        stem_stride=2,
+        zero_channels=(16, 32, 32, 32),
+        ffn=(64, 64, 64, 64),
+        decoder_channels=(32, 48, 64),
+        vpn_depths=(1, 2, 2),
+        vpn_channels=(16, 32, 64),
+        heads=2,
+        layers=1,
+        dropout=0.0,
+        ground_start=True,
+        zero_init_gain=4.0,
+        residual_init_gain=6.0,
+        foreground_prior=0.1,
+    ),
+    train=TrainConfig(
+        steps=600,
+        learning_rate=2e-3,
+        decay_every=25,
+        decay=0.85,
+        validate_every=100,
+        warmup=30,
+    ),
+    depth=TrainConfig(steps=8000, learning_rate=4e-3, decay_every=220, validate_every=1000, warmup=50),
+    texture=TextureConfig(scales=(0.5, 1.0)),
+    empty_fraction=0.2,
+    extruded_fraction=0.75,
+    test_views=24,
+)
+#: Weights for other people's images: more pixels, homes that are less alike, any camera, depth of any quality.
+_DEPLOY = replace(
+    _REDUCED,
+    name="deploy",
+    camera=CameraConfig(fpv_px=128, bev_px=40),
+    scenes=SceneConfig(train=300, validation=4, test=16, views=60, homes="varied", heights_m=(0.3, 1.8)),
+    model=replace(_REDUCED.model, seen=True, floor_depth=True),
+    train=TrainConfig(steps=20_000, learning_rate=2e-3, decay_every=500, decay=0.9, validate_every=1000, warmup=100),
+    depth=TrainConfig(steps=30_000, learning_rate=4e-3, decay_every=750, decay=0.9, validate_every=2000, warmup=100),
+    objects_fraction=0.5,
+    augment=AugmentConfig(looks=0.9, cameras=0.5, mirrored=0.5),
+    mixed_depth=True,
+)
+
 SCALES = {
     scale.name: scale
     for scale in (
@@ -243,44 +295,8 @@ SCALES = {
             depth=TrainConfig(steps=120, learning_rate=3e-3, decay_every=12, decay=0.75, validate_every=40, warmup=10),
             texture=TextureConfig(tiles=8, tile_px=512),
         ),
-        Scale(
-            name="reduced",
-            camera=CameraConfig(fpv_px=64, bev_px=40),
-            scenes=SceneConfig(train=200, validation=4, test=32, views=80),
-            model=ModelConfig(
-                width=32,
-                block="basic",
-                depths=(1, 2, 2, 2),
-                channels=(16, 32, 64, 128),
-                stem_channels=16,
-                stem_stride=2,
-                zero_channels=(16, 32, 32, 32),
-                ffn=(64, 64, 64, 64),
-                decoder_channels=(32, 48, 64),
-                vpn_depths=(1, 2, 2),
-                vpn_channels=(16, 32, 64),
-                heads=2,
-                layers=1,
-                dropout=0.0,
-                ground_start=True,
-                zero_init_gain=4.0,
-                residual_init_gain=6.0,
-                foreground_prior=0.1,
-            ),
-            train=TrainConfig(
-                steps=600,
-                learning_rate=2e-3,
-                decay_every=25,
-                decay=0.85,
-                validate_every=100,
-                warmup=30,
-            ),
-            depth=TrainConfig(steps=8000, learning_rate=4e-3, decay_every=220, validate_every=1000, warmup=50),
-            texture=TextureConfig(scales=(0.5, 1.0)),
-            empty_fraction=0.2,
-            extruded_fraction=0.75,
-            test_views=24,
-        ),
+        _REDUCED,
+        _DEPLOY,
         Scale(
             name="paper",
             camera=CameraConfig(fpv_px=384, bev_px=100),

@@ -143,7 +143,7 @@ def test_a_dead_kernel_is_reported_with_its_cell(folders):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"scale": "tiny"}, "scale: expected one of smoke, reduced, paper, found 'tiny'"),
+        ({"scale": "tiny"}, "scale: expected one of smoke, reduced, deploy, paper, found 'tiny'"),
         ({"scale": "smoke", "scenes": Path("no/such")}, "scenes: expected a folder, found nothing at no/such"),
         ({"scale": "smoke", "textures": Path(__file__)}, f"textures: expected a folder, found a file at {__file__}"),
         ({"scale": "smoke"}, "expected notebooks"),

@@ -3,7 +3,7 @@
 import numpy as np
 
 from zerobev.config import AugmentConfig, CameraConfig
-from zerobev.data.cameras import other_camera
+from zerobev.data.coverage import other_camera
 from zerobev.data.looks import new_look
 from zerobev.data.samples import Sample
 from zerobev.data.textures import TextureBank

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from zerobev.config import LABELS, AugmentConfig, CameraConfig, TextureConfig
 from zerobev.data.augment import Augmentation
-from zerobev.data.cameras import _covered_by, other_camera
+from zerobev.data.coverage import _covered_by, other_camera
 from zerobev.data.looks import _colors, new_look
 from zerobev.data.samples import SynthSamples, ViewSet, class_masks, view_sample
 from zerobev.data.sensor_depth import completed, mixed_depth

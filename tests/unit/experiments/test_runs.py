@@ -262,8 +262,35 @@ def test_a_training_is_not_computed_twice_at_a_time(workspace, monkeypatch):
             run.record() if folder == run.folder else run.pretraining.record
 
 
+def test_a_scale_for_any_camera_and_depth(tmp_path, monkeypatch):
+    """As `deploy`, at a tiny size: heights, looks, cameras, objects, mixed depth, and depth bounded by the floor."""
+    deploy = SCALES["deploy"]
+    tiny = replace(
+        TINY,
+        scenes=replace(deploy.scenes, train=1, validation=1, test=2, views=6),
+        model=replace(TINY.model, seen=True, floor_depth=True),
+        augment=deploy.augment,
+        objects_fraction=deploy.objects_fraction,
+        mixed_depth=True,
+    )
+    monkeypatch.setitem(SCALES, "tiny", tiny)
+    workspace = Workspace("tiny", root=tmp_path)
+    records = {row: Run(EXPERIMENTS[row], workspace).record() for row in ("a.1", "c", "d")}
+    view = workspace.views("train").locate(0)[1]
+    assert 0.3 <= view.height_m <= 1.8 and view.height_m != tiny.camera.height_m
+    # P^-1 with true depth is right from every height
+    assert records["a.1"].counts.pixel_iou() > 0.2
+    assert records["d"].config["mixed_depth"] and "mixed_depth" not in records["c"].config
+    residual = Run(EXPERIMENTS["d"], workspace)
+    assert residual.experiment.stages(tiny) == ("mixed",) and ZeroBEV.load(residual.weights).embedding.in_channels == 2
+    batch = residual.source("train", "mixed", 0).batch(0)
+    assert batch["height"].shape == (2,) and batch["rgb"].dtype == torch.uint8
+    again = residual.source("train", "mixed", 0).batch(0)
+    assert all(torch.equal(batch[name], again[name]) for name in batch)
+
+
 def test_a_scene_folder_that_is_missing_is_named(tmp_path):
     with pytest.raises(InputError, match=r"expected a folder in HM3DSem layout, found nothing at .*nowhere"):
         Workspace("smoke", str(tmp_path / "nowhere"))
-    with pytest.raises(InputError, match="expected one of smoke, reduced, paper, found 'huge'"):
+    with pytest.raises(InputError, match="expected one of smoke, reduced, deploy, paper, found 'huge'"):
         Workspace("huge")
