@@ -20,29 +20,30 @@ class FeaturePyramid(nn.Module):
             nn.init.kaiming_uniform_(layer.weight, a=1)
             nn.init.zeros_(layer.bias)
 
-    def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """Maps (N, channels[b], R_b, C_b), finest first, each half the size of the last -> (N, width, R_b, C_b)."""
-        return self.top_down([lateral(features) for lateral, features in zip(self.laterals, maps)])
+    def forward(self, maps: Sequence[Tensor], first: Sequence[Tensor] | None = None) -> list[Tensor]:
+        """Maps (N, channels[b], R_b, C_b), finest first, each half the size of the last -> (N, width, R_b, C_b).
 
-    def first_laterals(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """The first input channels' part of the laterals, with the bias: (N, width, R_b, C_b)."""
-        weights, biases = self._lateral_parameters()
-        return [F.conv2d(m, weight[:, : m.shape[1]], bias) for m, weight, bias in zip(maps, weights, biases)]
-
-    def last_laterals(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """The last input channels' part of the laterals: (N, width, R_b, C_b). The two parts add up to the laterals."""
-        weights, _ = self._lateral_parameters()
-        return [F.conv2d(m, weight[:, -m.shape[1] :]) for m, weight in zip(maps, weights)]
-
-    def _lateral_parameters(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-        weights, biases = ([layer.get_parameter(name) for layer in self.laterals] for name in ("weight", "bias"))
-        return weights, biases
-
-    def top_down(self, merged: list[Tensor]) -> list[Tensor]:
-        """Laterals (N, width, R_b, C_b), finest first -> the pyramid's maps, same shapes."""
+        first: `first_laterals` (B, width, R_b, C_b), if `maps` have only the other channels; each is added to N / B
+            consecutive maps. Laterals are linear, so this is the pyramid of all channels.
+        """
+        if first is None:
+            merged = [lateral(features) for lateral, features in zip(self.laterals, maps)]
+        else:
+            merged = [
+                (F.conv2d(m, weight[:, -m.shape[1] :]).unflatten(0, (len(shared), -1)) + shared[:, None]).flatten(0, 1)
+                for m, weight, shared in zip(maps, self._parameter("weight"), first)
+            ]
         for fine in range(len(merged) - 2, -1, -1):
             rows, columns = merged[fine].shape[-2:]
             # doubled and cropped, not stretched: coarse pixel i matches fine pixels 2i and 2i + 1 at odd sizes, too
             doubled = F.interpolate(merged[fine + 1], scale_factor=2, mode="nearest")
             merged[fine] = merged[fine] + doubled[..., :rows, :columns]
         return [output(features) for output, features in zip(self.outputs, merged)]  # the finest ones
+
+    def first_laterals(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """The laterals' part from their first input channels, with the bias: (B, width, R_b, C_b)."""
+        parts = zip(maps, self._parameter("weight"), self._parameter("bias"))
+        return [F.conv2d(m, weight[:, : m.shape[1]], bias) for m, weight, bias in parts]
+
+    def _parameter(self, name: str) -> list[nn.Parameter]:
+        return [layer.get_parameter(name) for layer in self.laterals]

@@ -78,15 +78,8 @@ class ZeroBEV(BevModel):
         return self.pyramid.first_laterals(self.backbone(rgb))
 
     def fpv_maps(self, laterals: Sequence[Tensor], zero: Tensor) -> list[Tensor]:
-        """The pyramid's maps of the RGB features concatenated with those of each zero-shot image, (B * K, width, ...).
-
-        The laterals are linear: their parts from the two images are added, and the first is computed once.
-        """
-        own = self.pyramid.last_laterals(self.zero_cnn(zero.flatten(0, 1)[:, None]))
-        k = zero.shape[1]
-        return self.pyramid.top_down(
-            [(o.unflatten(0, (-1, k)) + s[:, None]).flatten(0, 1) for o, s in zip(own, laterals)]
-        )
+        """The pyramid's maps of RGB features concatenated with those of each zero-shot image, (B * K, width, R_b, C_b)."""
+        return self.pyramid(self.zero_cnn(zero.flatten(0, 1)[:, None]), laterals)
 
     def attention(self, rgb: Tensor, zero: Tensor) -> list[BandAttention]:
         """Attention for B RGB images and zero-shot images (B, 1, H, W), near band first.
