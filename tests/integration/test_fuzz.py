@@ -477,11 +477,13 @@ def test_arguments_of_project(projector: zerobev.Projector) -> None:
     def make(rng: Random) -> tuple:
         rgb = _RGB if rng.random() < 0.7 else rng.choice((odd_array(rng), rng.choice(_NOTHING)))
         angle = 79 if rng.random() < 0.5 else rng.choice((*_ANGLES, *_NOTHING))
-        return rgb, any_modality(rng), angle, rng.choice((None, rng.choice(_NAMES)))
+        depth = None if rng.random() < 0.5 else rng.choice((odd_array(rng), rng.choice(_NOTHING), np.ones((8, 8))))
+        return rgb, any_modality(rng), angle, depth, rng.choice((None, rng.choice(_NAMES)))
 
     def parse(arguments: tuple) -> None:
-        rgb, modality, angle, names = arguments
-        maps = projector.project(rgb, modality() if callable(modality) else modality, angle, names)
+        rgb, modality, angle, depth, names = arguments
+        camera = angle if isinstance(angle, list) else zerobev.Camera(hfov_deg=angle, pitch_deg=len(str(angle)))
+        maps = projector.project(rgb, modality() if callable(modality) else modality, camera, depth, names)
         for bev in (maps.starts, maps.ends) if isinstance(maps, zerobev.BevArrows) else (maps,):
             assert np.isfinite(bev.values).all() and bev.values.min() >= 0 and bev.values.max() <= 1
             assert len(bev.values) == len(bev.labels)
@@ -495,7 +497,7 @@ def test_valid_arguments_of_project_are_accepted(projector: zerobev.Projector) -
     modalities = [_MASKS, _MASKS[0], _MASKS[0] + 1, _MASKS * 0.5, _MASKS.astype(">f4"), _MASKS[0].tolist()]
     modalities += [zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]), zerobev.Flow([[1, 1]], [[1e300, 2]])]
     for image, modality in zip(images * 2, modalities):
-        projector.project(image, modality, np.float32(66))
+        projector.project(image, modality, zerobev.Camera(np.float32(66)))
     (wide,) = zerobev.Boxes([[0, 0, 1e300, 4]], ["a"], [1]).layers((8, 8))[0].images
     assert wide[:4].all() and not wide[4:].any()  # a box that ends far outside covers all up to the border
 

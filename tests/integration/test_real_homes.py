@@ -12,8 +12,9 @@ from zerobev import cli
 from zerobev.common.errors import InputError
 from zerobev.config import LABELS, TextureConfig
 from zerobev.data.generate import generate_shard
-from zerobev.data.samples import ViewSet, semantic_batches
+from zerobev.data.samples import semantic_batches
 from zerobev.data.shards import Shard
+from zerobev.data.view_set import ViewSet
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.evaluation.metrics import Counts
 from zerobev.evaluation.real_homes import METHODS, DepthReport, Results, evaluate_homes, render_views

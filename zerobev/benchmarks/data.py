@@ -18,9 +18,10 @@ import numpy as np
 import torch
 
 from zerobev.config import CameraConfig, Scale
-from zerobev.data.samples import DepthProjSamples, ModSemSamples, SampleStream, SynthSamples, ViewSet
+from zerobev.data.samples import DepthProjSamples, ModSemSamples, SampleStream, SynthSamples
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank, modsem_textures, random_rectangles
+from zerobev.data.view_set import ViewSet
 from zerobev.data.views import View, ViewSource
 from zerobev.geometry.cameras import Pose
 from zerobev.geometry.projection import inverse_project_mask

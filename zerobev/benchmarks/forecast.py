@@ -23,8 +23,9 @@ from zerobev.benchmarks.data import home_folder, synth_stream, view_rates
 from zerobev.common.errors import InputError
 from zerobev.config import SPLITS, Scale
 from zerobev.data.generate import shard_path
-from zerobev.data.samples import ViewSet, as_float, collate, semantic_sample
+from zerobev.data.samples import as_float, collate, semantic_sample
 from zerobev.data.shards import Shard, write_shard
+from zerobev.data.view_set import ViewSet
 from zerobev.data.views import ViewSource
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.provenance import peak_memory_mb

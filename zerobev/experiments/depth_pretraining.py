@@ -17,7 +17,7 @@ import torch
 from zerobev.common.keys import plain
 from zerobev.common.storage import replacing
 from zerobev.config import Split
-from zerobev.data.samples import ViewSet
+from zerobev.data.view_set import ViewSet
 from zerobev.experiments import versions
 from zerobev.experiments.provenance import git_revision, origin, peak_memory_mb
 from zerobev.experiments.records import Record, find, key_of, write

@@ -3,7 +3,7 @@
 import numpy as np
 
 from zerobev.common.keys import fingerprint
-from zerobev.data.samples import ViewSet
+from zerobev.data.view_set import ViewSet
 from zerobev.experiments.run_records import RunStore
 from zerobev.experiments.workspace import Workspace
 

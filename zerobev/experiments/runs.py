@@ -21,11 +21,11 @@ from zerobev.data.samples import (
     SemanticPass,
     SemanticSamples,
     SynthSamples,
-    ViewSet,
     as_float,
     collate,
     semantic_sample,
 )
+from zerobev.data.view_set import ViewSet
 from zerobev.evaluation.evaluate import Predictor, evaluate, model_predictor
 from zerobev.experiments import versions
 from zerobev.experiments.depth_pretraining import DepthPretraining

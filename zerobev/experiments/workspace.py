@@ -23,9 +23,9 @@ from zerobev.config import SCALES, SPLITS, AugmentConfig, Split, TextureConfig
 from zerobev.data.augment import Augmentation
 from zerobev.data.generate import generate, shard_path
 from zerobev.data.patterns import SourceImages
-from zerobev.data.samples import ViewSet
 from zerobev.data.shards import Shard, recorded_with
 from zerobev.data.textures import TextureBank
+from zerobev.data.view_set import ViewSet
 from zerobev.experiments import versions
 from zerobev.scenes.hm3dsem import SceneFolders
 from zerobev.scenes.homes import ensure_home, ensure_homes, home_folders

@@ -15,7 +15,10 @@ def checked_depth(depth: Any, shape: tuple[int, int]) -> np.ndarray:
     depth: (H, W) floating point, metres; 0 or NaN for no value
     Raises `InputError` for another shape or type, for negative or infinite values, and for probable millimetres.
     """
-    values = np.asarray(depth)
+    try:
+        values = np.asarray(depth)
+    except (TypeError, ValueError):
+        raise InputError(f"depth: expected an array of the photograph's size {shape}, found {depth!r:.100}") from None
     if values.shape != shape:
         raise InputError(f"depth: expected the photograph's size {shape}, found {values.shape}")
     if not np.issubdtype(values.dtype, np.floating):

@@ -78,7 +78,7 @@ class ZeroBEV(BevModel):
         return self.pyramid.first_laterals(self.backbone(rgb))
 
     def fpv_maps(self, laterals: Sequence[Tensor], zero: Tensor) -> list[Tensor]:
-        """The pyramid's maps of RGB features concatenated with those of each zero-shot image, (B * K, width, R_b, C_b)."""
+        """The pyramid of RGB features concatenated with those of each zero-shot image: (B * K, width, R_b, C_b)."""
         return self.pyramid(self.zero_cnn(zero.flatten(0, 1)[:, None]), laterals)
 
     def attention(self, rgb: Tensor, zero: Tensor) -> list[BandAttention]:

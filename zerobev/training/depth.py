@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import TrainConfig
-from zerobev.data.samples import Augment, Sample, ViewSampler, ViewSet, as_float
+from zerobev.data.samples import Augment, Sample, as_float
+from zerobev.data.view_set import ViewSampler, ViewSet
 from zerobev.models.depth import DepthEstimator
 from zerobev.training.history import History
 from zerobev.training.loader import Batch

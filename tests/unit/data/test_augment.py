@@ -10,10 +10,11 @@ from zerobev.config import LABELS, AugmentConfig, CameraConfig, TextureConfig
 from zerobev.data.augment import Augmentation
 from zerobev.data.coverage import _covered_by, other_camera
 from zerobev.data.looks import _colors, new_look
-from zerobev.data.samples import SynthSamples, ViewSet, class_masks, view_sample
+from zerobev.data.samples import SynthSamples, class_masks, view_sample
 from zerobev.data.sensor_depth import completed, mixed_depth
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank
+from zerobev.data.view_set import ViewSet
 from zerobev.data.views import View, ViewSource
 from zerobev.geometry.cameras import Camera, fpv_rays
 from zerobev.geometry.projection import inverse_project_mask

@@ -16,7 +16,6 @@ from zerobev.data.samples import (
     SampleStream,
     SemanticSamples,
     SynthSamples,
-    ViewSet,
     as_float,
     collate,
     extruded_texels,
@@ -26,6 +25,7 @@ from zerobev.data.samples import (
 )
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import MODSEM_DRAWS, TextureBank
+from zerobev.data.view_set import ViewSet
 from zerobev.data.views import View, ViewSource
 from zerobev.geometry.projection import cells_of_pixels, inverse_project, map_points
 

@@ -30,7 +30,8 @@ from transformers import (
 
 from zerobev.common.errors import InputError
 from zerobev.config import SCALES, TrainConfig
-from zerobev.data.samples import ViewSet, as_float
+from zerobev.data.samples import as_float
+from zerobev.data.view_set import ViewSet
 from zerobev.data.views import View
 from zerobev.geometry.cameras import Camera
 from zerobev.inference import Projector

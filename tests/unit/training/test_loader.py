@@ -11,9 +11,10 @@ import torch
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig, TextureConfig
-from zerobev.data.samples import SemanticPass, SynthSamples, ViewSet, as_float
+from zerobev.data.samples import SemanticPass, SynthSamples, as_float
 from zerobev.data.shards import Shard, write_shard
 from zerobev.data.textures import TextureBank
+from zerobev.data.view_set import ViewSet
 from zerobev.data.views import ViewSource
 from zerobev.training.loader import batches, gpu_workers
 
