@@ -160,7 +160,7 @@ def measure(setting: Scale, repeats: int) -> dict[str, Any]:
         name: measure_inference(of, rows, modalities, machine, turns)
         for name, of, rows, modalities, turns in (
             (f"{setting.name}, {setting.camera.fpv_px} px", setting, ROWS, MODALITIES, repeats),
-            (f"{setting.name}, {_LARGE_PX} px", large, ROWS, MODALITIES, few(repeats)),
+            (f"{setting.name}, {_LARGE_PX} px", large, ROWS, MODALITIES, repeats),
             ("paper", scale("paper"), PAPER_ROWS, MODALITIES[:2], 1),
         )
     }
