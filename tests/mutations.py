@@ -109,6 +109,42 @@ MUTATIONS = (
         "torch.floor((camera.bev_extent_m / 2 - x)",
         ("tests/unit/geometry/test_projection.py",),
     ),
+    Mutation(
+        "a limit on heights that falls with the camera's height",
+        "zerobev/geometry/projection.py",
+        "camera.max_height_m * camera.height_m / height_m",
+        "camera.max_height_m * height_m / camera.height_m",
+        ("tests/unit/inference/test_projector.py::test_a_limit_on_heights_follows_the_camera_s_height",),
+    ),
+    # cameras
+    Mutation(
+        "roll to the other side",
+        "zerobev/geometry/cameras.py",
+        "[[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]]",
+        "[[cr, sr, 0], [-sr, cr, 0], [0, 0, 1]]",
+        ("tests/unit/inference/test_pinhole.py",),
+    ),
+    Mutation(
+        "no stretch for another height of a level camera",
+        "zerobev/inference/pinhole.py",
+        "fy *= camera.height_m / network.height_m",
+        "fy *= 1",
+        ("tests/unit/inference/test_pinhole.py",),
+    ),
+    Mutation(
+        "mirrored images with maps as they were",
+        "zerobev/data/augment.py",
+        '"depth", "target", "aux", "fov")',
+        '"depth")',
+        ("tests/unit/data/test_augment.py",),
+    ),
+    Mutation(
+        "the pyramid of a zero-shot image with weights of the RGB image",
+        "zerobev/models/pyramid.py",
+        "weight[:, -m.shape[1] :]",
+        "weight[:, : m.shape[1]]",
+        ("tests/unit/models/test_networks.py",),
+    ),
     # the zero-shot stream
     Mutation(
         "zero-shot image one pixel to the right",

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from zerobev.common.errors import InputError
@@ -112,6 +112,8 @@ def test_angles_turn_the_camera_as_documented():
 
 
 @given(TILTED)
+@example(Camera(height_m=0.5))
+@example(Camera(height_m=1.5))
 def test_any_camera_s_photograph_becomes_that_of_the_level_camera(camera):
     """Colours are affine in the direction's slopes after the vertical stretch, so the expected image is known."""
     shape = (240, 320)
@@ -129,6 +131,8 @@ def test_any_camera_s_photograph_becomes_that_of_the_level_camera(camera):
 
 
 @given(TILTED)
+@example(Camera(height_m=0.5))
+@example(Camera(height_m=1.5))
 def test_a_tilted_camera_with_depth_gives_the_level_camera_s_map(camera):
     """A box on the floor of a room: its mask and depth, seen by any camera, are projected to the box's cells."""
     scene = build([*room((10, 10, 2.5), (-5, -1, 0)), box("chair", (-0.6, 2.2, 0), (0.6, 3.0, 0.6))])
