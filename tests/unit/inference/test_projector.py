@@ -385,6 +385,24 @@ def test_the_command_writes_what_project_returns(models, rgb, masks, tmp_path, c
             assert file["labels"].tolist() == expected
 
 
+def test_the_command_takes_a_camera_and_the_depth_of_a_sensor(models, rgb, masks, tmp_path):
+    photo, mask, out = (tmp_path / name for name in ("photo.png", "floor.png", "map.png"))
+    Image.fromarray(rgb).save(photo)
+    Image.fromarray(masks[0].astype(np.uint8)).save(mask)
+    depth = np.full((SIDE, SIDE), 2.5, np.float32)
+    np.save(tmp_path / "depth.npy", depth)
+    options = ("--lens", 45, 50, 30, 33, "--height", 1.2, "--pitch", -15, "--roll", 3)
+    command(photo, "--masks", mask, *options, "--depth", tmp_path / "depth.npy", "--out", out, "--row", "a.2")
+    camera = zerobev.Camera(fx=45, fy=50, cx=30, cy=33, height_m=1.2, pitch_deg=-15, roll_deg=3)
+    expected = models["a.2"].project(rgb, masks[0], camera, depth)
+    assert expected.maps.any()
+    with np.load(out.with_suffix(".npz")) as file:
+        np.testing.assert_array_equal(file["values"], expected.values)
+    (tmp_path / "bad.npy").write_text("nothing")
+    with pytest.raises(InputError, match=r"bad\.npy: expected an array in NumPy's format"):
+        command(photo, "--masks", mask, "--depth", tmp_path / "bad.npy", "--out", out)
+
+
 def test_the_command_names_the_fault(rgb, tmp_path):
     photo, text, voc, small = (tmp_path / f"{name}.png" for name in ("photo", "text", "voc", "small"))
     Image.fromarray(np.array([[0, 7, 255]] * 3, np.uint8)).save(voc)
