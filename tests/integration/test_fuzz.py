@@ -277,7 +277,7 @@ def test_all_supported_features_of_gltf(rich_home: Path, name: str) -> None:
     with changed(rich_home, name) as (whole, parse):
         parse(whole)
         seen = fuzz(lambda rng: with_header(whole, lambda header: edited(rng, header)), 400, parse)
-    assert min(seen["read"], seen["refused"]) > 40
+    assert min(seen["read"], seen["refused"]) > 20
 
 
 IMPOSSIBLE = {
