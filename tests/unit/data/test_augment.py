@@ -177,6 +177,8 @@ def test_a_mirrored_sample_is_that_of_a_mirrored_room(scene, views, bank):
     for view in views:
         before = sample_of(view, scene)
         after = mirror(before, view, 2, np.random.default_rng(0))
+        for name in ("target", "aux", "fov"):
+            assert np.array_equal(after[name], before[name][..., ::-1])
         for k in range(len(LABELS)):
             camera = view.seen_by(CAMERA)
             direct = inverse_project_mask(after["zero"][k], after["depth"][0], camera)
