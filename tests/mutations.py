@@ -132,6 +132,13 @@ MUTATIONS = (
         ("tests/unit/inference/test_pinhole.py",),
     ),
     Mutation(
+        "photographs from another height without the stretch",
+        "zerobev/rendering/photograph.py",
+        "self._eye.camera.fx / pose.stretch(self._camera)",
+        "self._eye.camera.fx",
+        ("tests/unit/data/test_augment.py",),
+    ),
+    Mutation(
         "mirrored images with maps as they were",
         "zerobev/data/augment.py",
         '"depth", "target", "aux", "fov")',

@@ -38,9 +38,7 @@ def _covered_by(
 ) -> tuple[np.ndarray, np.ndarray]:
     fx, fy, cx, cy = other.lens(shape)
     rays = _rays(camera) * np.array([[1], [stretch], [1]], np.float32)
-    x, y, z = (other.level_R_camera.T.astype(np.float32) @ rays).reshape(3, camera.fpv_px, camera.fpv_px)
-    z = np.maximum(z, np.float32(1e-3))
-    u, v = cx + fx * x / z, cy + fy * y / z
+    u, v, _ = other.positions(rays.reshape(3, camera.fpv_px, camera.fpv_px), shape)
     covered = (u >= 0) & (u < shape[1]) & (v >= 0) & (v < shape[0])
     # the nearest pixel of the photograph, and back to the level view
     side = camera.fpv_px

@@ -10,7 +10,7 @@ from zerobev.models.variants import VARIANTS
 class Experiment:
     """One row of a table: a network trained on a stream, or P^-1, which is not trained.
 
-    Raises `InputError` for an unknown network, stream or depth.
+    Raises `InputError` for an unknown network, stream or depth; a test has no "mixed" depth.
     """
 
     row: str
@@ -30,7 +30,7 @@ class Experiment:
         one_of("stream", self.stream, Stream)
         for depth in self.train_depth:
             one_of("train_depth", depth, Depth)
-        one_of("test_depth", self.test_depth, Depth)
+        one_of("test_depth", self.test_depth, ("true", "estimated"))
 
     @property
     def reads_depth(self) -> bool:

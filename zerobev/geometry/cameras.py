@@ -69,6 +69,18 @@ class Camera:
         focal_px = 0.5 * shape[1] / math.tan(math.radians(max(hfov_deg, _MIN_HFOV_DEG)) / 2)
         return focal_px, focal_px, shape[1] / 2, shape[0] / 2
 
+    def positions(self, rays: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Image positions of rays in images of `shape` (H, W): u and v, pixels, and depth along the optical axis.
+
+        rays: (3, ...) right, down and forward in the frame of a level camera; results have their type
+        Rays from behind the camera get positions far outside the image, on their side of it. No ray of a level view is
+        near the direction opposite to a pitch below 90 degrees, so none falls on the image.
+        """
+        fx, fy, cx, cy = self.lens(shape)
+        x, y, z = np.tensordot(self.level_R_camera.T.astype(rays.dtype), rays, axes=1)
+        z = np.maximum(z, z.dtype.type(1e-6))
+        return cx + fx * x / z, cy + fy * y / z, z
+
     @property
     def level_R_camera(self) -> np.ndarray:
         """(3, 3) float64: columns are the camera's right, down and forward in the frame of a level camera."""

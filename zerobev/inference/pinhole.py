@@ -103,23 +103,17 @@ class PinholeView:
         return np.where(inside, values / np.where(inside, forward, 1), 0).astype(np.float32)
 
     def _positions(self, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image positions u, v of the view of `network` in rows x columns pixels, and their depth at level depth 1.
-
-        Positions behind the camera are NaN.
-        """
-        network, (fx, fy, cx, cy) = self._network, self._camera.lens(self._shape)
+        """Image positions u, v of the view of `network` in rows x columns pixels, and their depth at level depth 1."""
+        network = self._network
         half = 0.5 * network.fpv_px / network.focal_px
         across, down = (half * ((2 * np.arange(n) + 1) / n - 1) for n in (columns, rows))
         x, y = np.meshgrid(across, down * self._camera.height_m / network.height_m)
-        ahead = self._camera.level_R_camera.T @ np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
-        x, y, z = ahead.reshape(3, rows, columns)
-        z = np.where(z > 0, z, np.nan)
-        return cx + fx * x / z, cy + fy * y / z, z
+        return self._camera.positions(np.stack([x, y, np.ones_like(x)]), self._shape)
 
 
 def _nearest(position: np.ndarray, length: int) -> np.ndarray:
-    """Index of the pixel at each position, or of the nearest one in the image; 0 for NaN."""
-    return np.nan_to_num(np.clip(np.floor(position), 0, length - 1)).astype(np.intp)
+    """Index of the pixel at each position, or of the nearest one in the image."""
+    return np.clip(np.floor(position), 0, length - 1).astype(np.intp)
 
 
 def _fractions(length_px: int, focal_px: float, centre_px: float, network: CameraConfig) -> np.ndarray:

@@ -84,7 +84,12 @@ def test_every_row_of_every_table_is_a_run_and_each_run_is_one_row():
 
 def test_a_misspelt_depth_stream_or_split_is_an_error(workspace):
     """True depth in place of misspelt estimated depth would make the row an oracle."""
-    for field, value in (("test_depth", "predicted"), ("train_depth", ("true", "estimate")), ("stream", "texture")):
+    for field, value in (
+        ("test_depth", "predicted"),
+        ("test_depth", "mixed"),
+        ("train_depth", ("true", "estimate")),
+        ("stream", "texture"),
+    ):
         with pytest.raises(InputError, match=f"{field}: expected one of .*, found"):
             replace(RESIDUAL, **{field: value})
     run = Run(RESIDUAL, workspace)

@@ -165,6 +165,14 @@ def test_impossible_cameras_are_refused(arguments, message):
         Camera(**arguments)
 
 
+def test_what_lies_behind_the_camera_has_the_colour_of_the_nearest_border():
+    """The camera looks up from high above the floor: the lowest rays of the level view are behind it."""
+    rgb = np.zeros((120, 160, 3))
+    rgb[:60] = 1.0
+    view = PinholeView((120, 160), Camera(pitch_deg=40, height_m=1.8), CAMERA)
+    assert not view.covered[-1].any() and (view.photograph(rgb)[-1] == 0).all()
+
+
 def test_a_camera_that_looks_elsewhere_is_refused():
     with pytest.raises(InputError, match=r"camera: expected a view that covers a pixel .* level, found Camera\("):
         PinholeView((48, 48), Camera(hfov_deg=20, pitch_deg=80), CAMERA)
