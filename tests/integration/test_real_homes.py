@@ -90,7 +90,7 @@ def test_depth_errors_and_reasons(homes, results):
     floor = known & (batch["zero"][:, [LABELS.index("floor")]] > 0)
     assert report.floor_ratio == pytest.approx(float((estimated / batch["depth"])[floor].median()), rel=1e-4)
     good = DepthReport(relative=0.1, mad_m=0.2, floor_ratio=1.0, brightness=0.5, median_m=2.0)
-    assert good.reasons() == "depth is right here: the map is what fails"
+    assert good.reasons() == "no reason found in estimated depth, light or distances"
     assert "puts the floor at 0.50 of its distance" in replace(good, floor_ratio=0.5, relative=0.5).reasons()
     assert "35% off, on walls and objects" in replace(good, relative=0.35).reasons()
     assert "dark" in replace(good, brightness=0.1).reasons() and "near" in replace(good, median_m=1.0).reasons()

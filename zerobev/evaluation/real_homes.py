@@ -78,7 +78,7 @@ class DepthReport:
             found.append(f"the photographs are dark (mean brightness {self.brightness:.2f})")
         if self.median_m < _NEAR_M:
             found.append(f"most surfaces are near (median {self.median_m:.1f} m), so little floor is in view")
-        return "; ".join(found) or "depth is right here: the map is what fails"
+        return "; ".join(found) or "no reason found in estimated depth, light or distances"
 
 
 @dataclass(frozen=True)
