@@ -211,6 +211,7 @@ class Scale:
     extruded_fraction: float = 0.0  #: fraction of *Synth* samples with extruded textures (not in the paper)
     objects_fraction: float = 0.0  #: fraction of *Synth* samples with whole instances in white (not in the paper)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    log_depth: bool = False  #: the depth estimator's loss compares logarithms (not in the paper)
     mixed_depth: bool = False  #: residual networks are trained with depth of any quality (not in the paper)
     test_views: int | None = None  #: networks are evaluated on the first so many of each test scene; None: all
     #: initial weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's

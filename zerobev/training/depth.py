@@ -1,6 +1,7 @@
 """Training, evaluation and use of depth estimators (paper, supplement, "Finetuning monocular depth estimation").
 
-The objective is the mean absolute difference in metres, for our own network and for fine-tuning.
+The paper's objective is the mean absolute difference in metres, for our own network and for fine-tuning. That of
+logarithms weights near and far surfaces alike.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from zerobev.models.depth import DepthEstimator
 from zerobev.training.history import History
 from zerobev.training.loader import Batch
 from zerobev.training.losses import Losses
-from zerobev.training.train import train
+from zerobev.training.train import Objective, train
 
 _BATCH = 32  # images per forward pass
 
@@ -59,6 +60,14 @@ def depth_objective(model: nn.Module, batch: Batch) -> Losses:
     return Losses(loss, loss)
 
 
+def log_depth_objective(model: nn.Module, batch: Batch) -> Losses:
+    """Mean absolute difference of the logarithms of depth, over the pixels with known depth (not in the paper)."""
+    valid = batch["depth"] > 0
+    error = (model(batch["rgb"]).float().log() - torch.where(valid, batch["depth"], 1).log()).abs()
+    loss = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
+    return Losses(loss, loss)
+
+
 def train_depth(
     model: nn.Module,
     views: ViewSet,
@@ -69,16 +78,18 @@ def train_depth(
     *,
     key: str,
     augment: Augment | None = None,
+    objective: Objective = depth_objective,
     device: torch.device | str | None = None,
 ) -> History:
     """Train a `DepthEstimator` in place, to the weights with the best validation score (see `training.train`).
 
     augment: changes each training sample at random
-    validation: all its views, unmirrored; the score is the mean absolute difference over them, metres
+    objective: `depth_objective` or `log_depth_objective`; the score is its mean over `validation`
+    validation: all its views, unmirrored
     """
     held_out = [_views_batch(validation, first) for first in range(0, len(validation), _BATCH)]
     data = DepthSamples(views, seed, config.batch, augment)
-    return train(model, data, held_out, config, folder, seed, key=key, objective=depth_objective, device=device)
+    return train(model, data, held_out, config, folder, seed, key=key, objective=objective, device=device)
 
 
 @dataclass(frozen=True)

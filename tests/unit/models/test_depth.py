@@ -1,6 +1,7 @@
 """Depth in metres: training pairs, errors in closed form, our network, and models of the transformers library."""
 
 import json
+import math
 import re
 from dataclasses import fields, replace
 from pathlib import Path
@@ -39,7 +40,15 @@ from zerobev.inference.pinhole import PinholeView
 from zerobev.models.backbone import IMAGENET_MEAN, IMAGENET_STD, RgbEncoder
 from zerobev.models.backbone_weights import load_backbone
 from zerobev.models.depth import FARTHEST_M, DepthNet, HubDepth
-from zerobev.training.depth import DepthErrors, DepthSamples, depth_errors, depth_objective, predict_depth, train_depth
+from zerobev.training.depth import (
+    DepthErrors,
+    DepthSamples,
+    depth_errors,
+    depth_objective,
+    log_depth_objective,
+    predict_depth,
+    train_depth,
+)
 
 SMOKE = SCALES["smoke"]
 
@@ -125,6 +134,14 @@ def test_the_objective_is_the_mean_absolute_difference_over_known_depth():
     assert predicted.grad.tolist() == [-0.5, 0.5, 0.0, 0.0]
     nothing = depth_objective(lambda rgb: predicted, batch | {"depth": torch.zeros(4)})
     assert float(nothing.total.detach()) == 0
+
+
+def test_the_objective_of_logarithms_is_equal_for_equal_ratios():
+    predicted = torch.tensor([0.5, 8.0, 9.0], requires_grad=True)
+    losses = log_depth_objective(lambda rgb: predicted, {"rgb": torch.zeros(1), "depth": torch.tensor([1.0, 4.0, 0.0])})
+    losses.total.backward()
+    assert float(losses.total.detach()) == pytest.approx(math.log(2))
+    np.testing.assert_allclose(predicted.grad, [-1.0, 1 / 16, 0.0], atol=1e-7)
 
 
 def test_errors_in_closed_form():
