@@ -20,6 +20,7 @@ import numpy as np
 
 from zerobev.common.errors import InputError, attempt
 from zerobev.common.keys import matches, plain
+from zerobev.common.memory import return_freed_memory
 from zerobev.common.parallel import cluster, run_jobs
 from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
@@ -137,8 +138,10 @@ def _attempt(
     try:
         return attempt(record)
     finally:
-        # meshes have reference cycles; without this joblib replaces the worker because of a supposed memory leak
+        # meshes have reference cycles, and freed memory is kept in small pieces; joblib would suspect a memory leak and
+        # replace the worker, which costs as much as a scene
         gc.collect()
+        return_freed_memory()
 
 
 def _scene_seed(scene_folder: Path, seed: int) -> list[int]:

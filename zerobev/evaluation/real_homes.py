@@ -3,8 +3,8 @@
 Reads homes in HM3DSem layout: a data set, one of its parts such as `val/`, or one scene. Prints IoU, depth errors and
 the homes that fail most, and writes all of it with `--json`. The networks were trained only on generated homes, so all
 annotated scenes of the folder are test scenes. Views are rendered, not stored. Rows: P^-1 with true depth (a.1) and
-with estimated depth (a.2); the shipped networks, residual ones also with the depth of a depth camera (.sensor, see
-`data.sensor_depth`) and with true depth (.true); floor over the whole field of view (constant).
+with estimated depth (a.2); the shipped networks, residual ones also without depth (.none), with the depth of a depth
+camera (.sensor, see `data.sensor_depth`) and with true depth (.true); floor over the whole field of view (constant).
 """
 
 import argparse
@@ -47,7 +47,7 @@ METHODS = {
     **{
         f"{row}.{depth}": f"Zero-BEV ({row}) with {text}"
         for row in _RESIDUAL
-        for depth, text in (("sensor", "a depth camera"), ("true", "true depth"))
+        for depth, text in (("none", "no depth"), ("sensor", "a depth camera"), ("true", "true depth"))
     },
     CONSTANT: "floor over the whole field of view",
 }
@@ -125,9 +125,7 @@ class Results:
             row: {
                 "class_iou": one.class_iou(),
                 "pixel_iou": one.pixel_iou(),
-                "weights": run_of(shipped(row.removesuffix(".true").removesuffix(".sensor")))
-                if _is_network(row)
-                else None,
+                "weights": run_of(shipped(_network_of(row))) if _is_network(row) else None,
                 **one.to_json(),
             }
             for row, one in self.counts.items()
@@ -139,6 +137,12 @@ class Results:
 
 def _is_network(row: str) -> bool:
     return row not in (ORACLE, GEOMETRIC, CONSTANT)
+
+
+def _network_of(row: str) -> str:
+    """The shipped row without the kind of its depth."""
+    stem, _, kind = row.rpartition(".")
+    return stem if kind in ("none", "sensor", "true") else row
 
 
 def render_views(folder: Path, views: int, camera: CameraConfig, seed: int) -> dict[str, Tensor]:
@@ -194,7 +198,7 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
         estimated = projectors[ROWS[0]].estimator(batch["rgb"])
     pairs = zip(batch["sensor"].numpy(), estimated.numpy())
     measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
-    depths = {"": estimated, ".true": batch["depth"], ".sensor": measured}
+    depths = {"": estimated, ".none": torch.zeros_like(estimated), ".true": batch["depth"], ".sensor": measured}
     heights = batch.get("height")
     maps = {
         ORACLE: inverse_project(batch["zero"], batch["depth"], camera, heights) > 0,
