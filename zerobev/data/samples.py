@@ -8,7 +8,7 @@ one byte per value; networks take the result of `as_float`. If views are from di
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -19,6 +19,7 @@ from zerobev.data.sensor_depth import mixed_depth
 from zerobev.data.textures import MODSEM_DRAWS, TextureBank, random_rectangles
 from zerobev.data.view_set import ViewSampler, ViewSet
 from zerobev.data.views import View
+from zerobev.data.visibility import VISIBILITY
 from zerobev.geometry.cameras import Pose, bev_cell_centres
 from zerobev.geometry.projection import inverse_project_mask, map_coordinates
 
@@ -190,10 +191,16 @@ class SemanticSamples(SampleStream):
 
 
 class SemanticPass:
-    """All views once, in order, with the eight classes as modalities (K = 8, in the order of `LABELS`), in batches."""
+    """All views once, in order, with the eight classes as modalities (K = 8, in the order of `LABELS`), in batches.
 
-    def __init__(self, views: ViewSet, camera: CameraConfig, batch: int) -> None:
-        self._views, self._camera, self._batch = views, camera, batch
+    visibility: `Workspace.visibility` of the views' scenes; batches then have `visibility` (B, 3, M, M) bool, the parts
+        of the map in the order of `data.visibility.VISIBILITY`
+    """
+
+    def __init__(
+        self, views: ViewSet, camera: CameraConfig, batch: int, visibility: Sequence[np.ndarray] | None = None
+    ) -> None:
+        self._views, self._camera, self._batch, self._visibility = views, camera, batch, visibility
 
     def __len__(self) -> int:
         return -(-len(self._views) // self._batch)
@@ -202,7 +209,15 @@ class SemanticPass:
         """Batch `number`; the last may be smaller. Each of several ranks gets every `world_size`-th of its views."""
         last = min((number + 1) * self._batch, len(self._views))
         chosen = range(number * self._batch + rank, last, world_size)
-        return collate([semantic_sample(self._views, i, self._camera) for i in chosen])
+        return collate([self._sample(i) for i in chosen])
+
+    def _sample(self, index: int) -> Sample:
+        sample = semantic_sample(self._views, index, self._camera)
+        if self._visibility is None:
+            return sample
+        scene, number = self._views.place(index)
+        parts = np.arange(len(VISIBILITY))[:, None, None]
+        return sample | {"visibility": self._visibility[scene][number] == parts}
 
 
 def semantic_batches(views: ViewSet, camera: CameraConfig, batch: int) -> Iterator[dict[str, torch.Tensor]]:

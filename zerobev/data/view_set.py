@@ -66,13 +66,17 @@ class ViewSet:
         """(H, H) float32, estimated depth of view `index`, metres; None without estimates."""
         if self._estimates is None:
             return None
+        shard, number = self.place(index)
+        return np.asarray(self._estimates[shard][number], np.float32)
+
+    def place(self, index: int) -> tuple[int, int]:
+        """Number of the shard that holds view `index`, and the view's number in it."""
         shard = int(np.searchsorted(self._start, index, side="right")) - 1
-        return np.asarray(self._estimates[shard][index - int(self._start[shard])], np.float32)
+        return shard, index - int(self._start[shard])
 
     def locate(self, index: int) -> tuple[int, View]:
         """Number of the shard that holds view `index`, and the view."""
-        shard = int(np.searchsorted(self._start, index, side="right")) - 1
-        number = index - int(self._start[shard])
+        shard, number = self.place(index)
         view = self.shards[shard].view(number)
         if self._depth is None:
             return shard, view

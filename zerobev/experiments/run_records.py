@@ -10,6 +10,7 @@ import numpy as np
 from zerobev.common.errors import InputError
 from zerobev.common.keys import matches
 from zerobev.common.storage import replacing
+from zerobev.evaluation.evaluate import PartCounts
 from zerobev.evaluation.metrics import Counts
 from zerobev.experiments.records import Record, read, write
 
@@ -37,6 +38,14 @@ class RunRecord(Record):
         """Intersections and unions per test scene and class."""
         return Counts.from_json(self.result["counts"])
 
+    @cached_property
+    def parts(self) -> dict[str, PartCounts]:
+        """Counts per part of the maps, see `data.visibility`; empty in records without them."""
+        return {
+            name: PartCounts(*(Counts.from_json(part[kind]) for kind in ("iou", "recall")))
+            for name, part in self.result.get("parts", {}).items()
+        }
+
     @property
     def history(self) -> dict[str, list[float | None]]:
         """Training curves by name; empty if nothing is trained."""
@@ -47,6 +56,11 @@ class RunRecord(Record):
         if type(self.row) is not str or type(self.seed) is not int or type(self.history) is not dict:
             raise InputError("expected a row, a seed and a history, found other types")
         names = [name for name in self.scenes if isinstance(name, str)]
+        if (
+            self.parts
+            and sum((part.iou for part in self.parts.values()), Counts.empty(*self.counts.union.shape)) != self.counts
+        ):
+            raise InputError("parts: expected the sum of their counts to be all counts, found others")
         if not len(names) == len(self.scenes) == len(self.counts.union):
             raise InputError(f"scenes: expected a name for each of {len(self.counts.union)}, found {len(names)}")
 

@@ -26,7 +26,8 @@ from zerobev.data.samples import (
     semantic_sample,
 )
 from zerobev.data.view_set import ViewSet
-from zerobev.evaluation.evaluate import Predictor, evaluate, model_predictor
+from zerobev.evaluation.evaluate import Predictor, evaluate_parts, model_predictor
+from zerobev.evaluation.metrics import Counts
 from zerobev.experiments import versions
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.gallery import gallery_indices
@@ -149,10 +150,12 @@ class Run:
         estimated = self.experiment.reads_depth and self.experiment.test_depth == "estimated"
         test = self.views("test", "estimated" if estimated else "true")
         trained = time.monotonic()
-        passed = SemanticPass(test.first(self.workspace.scale.test_views), camera, _EVALUATION_BATCH)
+        chosen = test.first(self.workspace.scale.test_views)
+        passed = SemanticPass(chosen, camera, _EVALUATION_BATCH, self.workspace.visibility("test"))
         rank, world_size = rank_and_world_size()
         drawn = batches(passed, range(rank, len(passed), world_size), torch.device(device))
-        counts = evaluate(predict, drawn, len(test.shards), len(LABELS))
+        parts = evaluate_parts(predict, drawn, len(test.shards), len(LABELS))
+        counts = sum((part.iou for part in parts.values()), Counts.empty(len(test.shards), len(LABELS)))
         cost = {
             "train_seconds": round(history.seconds if history else 0.0, 1),
             "evaluate_seconds": round(time.monotonic() - trained, 1),
@@ -161,6 +164,9 @@ class Run:
         result = {
             "scenes": [shard.scene for shard in test.shards],
             "counts": counts.to_json(),
+            "parts": {
+                name: {"iou": part.iou.to_json(), "recall": part.recall.to_json()} for name, part in parts.items()
+            },
             "history": history.curves() if history else {},
         }
         record = RunRecord(self.key, plain(self.config), origin(device, revision), cost, result)

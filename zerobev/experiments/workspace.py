@@ -11,21 +11,25 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 
 from zerobev import config
 from zerobev.common.errors import InputError
 from zerobev.common.keys import fingerprint
 from zerobev.common.locks import locked
+from zerobev.common.parallel import run_jobs
 from zerobev.common.paths import report_name, zerobev_home
 from zerobev.common.settings import changed_by
-from zerobev.config import SCALES, SPLITS, AugmentConfig, Split, TextureConfig
+from zerobev.common.storage import replacing
+from zerobev.config import SCALES, SPLITS, AugmentConfig, CameraConfig, Split, TextureConfig
 from zerobev.data.augment import Augmentation
 from zerobev.data.generate import generate, shard_path
 from zerobev.data.patterns import SourceImages
 from zerobev.data.shards import Shard, recorded_with
 from zerobev.data.textures import TextureBank
 from zerobev.data.view_set import ViewSet
+from zerobev.data.visibility import shard_visibility
 from zerobev.experiments import versions
 from zerobev.scenes.hm3dsem import SceneFolders
 from zerobev.scenes.homes import ensure_home, ensure_homes, home_folders
@@ -144,6 +148,20 @@ class Workspace:
                 raise InputError("; ".join(broken.values()))
         return ViewSet([Shard(shard_path(f, out), self.scale.camera, self.scale.texture) for f in folders])
 
+    def visibility(self, split: Split) -> list[np.ndarray]:
+        """`data.visibility` of the views of a split: (V, M, M) uint8 per scene; missing arrays are made now."""
+        shards = self.views(split).shards
+        folder = self.views_folder / f"{split}-visibility"
+        paths = {shard.path.stem: folder / f"{shard.path.stem}.npy" for shard in shards}
+        jobs = [
+            joblib.delayed(_save_visibility)(scene, shard, self.scale.camera, paths[shard.path.stem])
+            for scene, shard in zip(self.split.of(split), shards)
+            if not paths[shard.path.stem].exists()
+        ]
+        for _ in run_jobs(jobs, self._workers, "visibility", len(jobs)):
+            pass
+        return [np.load(path) for path in paths.values()]
+
     @cached_property
     def augmentation(self) -> Augmentation | None:
         """The random changes of training samples; None if the scale has none."""
@@ -159,3 +177,9 @@ class Workspace:
             sources = SourceImages(self._textures)
             TextureBank.build(texture, sources, np.random.default_rng(self.scale.scenes.seed)).save(path)
         return TextureBank.load(path)
+
+
+def _save_visibility(scene_folder: Path, shard: Shard, camera: CameraConfig, path: Path) -> None:
+    found = shard_visibility(scene_folder, shard, camera)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.save(file, found)

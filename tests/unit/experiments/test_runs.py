@@ -11,7 +11,7 @@ import torch
 from zerobev.common.errors import InputError
 from zerobev.common.keys import plain
 from zerobev.common.locks import locked
-from zerobev.config import SCALES, SceneConfig, TextureConfig, TrainConfig
+from zerobev.config import LABELS, SCALES, SceneConfig, TextureConfig, TrainConfig
 from zerobev.data.samples import as_float, semantic_batches
 from zerobev.experiments import runs
 from zerobev.experiments.depth_pretraining import DepthPretraining
@@ -218,6 +218,22 @@ def test_the_key_follows_what_a_run_depends_on_and_nothing_else(workspace, monke
     assert Run(PROJECTION, changed).key != projection
 
 
+def test_counts_of_parts_tell_what_is_projected_from_what_is_inferred(workspace):
+    """P^-1 with true depth fills the seen cells of the floor, and no others."""
+    oracle, network = (Run(row, workspace).record() for row in (PROJECTION, ZERO_BEV))
+    for record in (oracle, network):
+        assert sum((part.iou for part in record.parts.values()), record.counts.empty(2, 8)) == record.counts
+        for part in record.parts.values():
+            assert (part.iou.intersection == part.recall.intersection).all()
+            assert (part.recall.union <= part.iou.union).all()
+    floor = LABELS.index("floor")
+    recalled = {name: part.recall.iou_per_class()[floor] for name, part in oracle.parts.items()}
+    assert recalled["seen"] > 0.85 and recalled["between"] == recalled["hidden"] == 0
+    assert all(oracle.parts[name].iou.intersection.sum() == 0 for name in ("between", "hidden"))
+    targets = [{name: part.recall.union for name, part in record.parts.items()} for record in (oracle, network)]
+    assert all((targets[0][name] == targets[1][name]).all() for name in targets[0])
+
+
 def test_the_gallery_holds_the_predictions_of_the_saved_weights(workspace):
     record = Run(ZERO_BEV, workspace).record()
     views = gallery(workspace)
@@ -250,6 +266,10 @@ def test_spot_check_agrees_only_with_an_unchanged_record(workspace):
     counts["intersection"] = [[cells // 2 for cells in scene] for scene in counts["intersection"]]
     path.write_text(json.dumps(record))
     try:
+        with pytest.raises(InputError, match="parts: expected the sum of their counts"):
+            spot_check(workspace, "a.1")
+        del record["result"]["parts"]
+        path.write_text(json.dumps(record))
         changed = spot_check(workspace, "a.1")
         assert not changed.agrees and "DOES NOT AGREE" in str(changed)
     finally:
