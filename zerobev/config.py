@@ -324,6 +324,7 @@ SCALES = {
                 vpn_depths=(2, 2, 2),
                 vpn_channels=(64, 128, 256),
             ),
+            # an epoch has 18,125 steps; 20 epochs and a decay per epoch are ours, since the paper gives neither
             train=TrainConfig(steps=18_125 * 20, learning_rate=1e-4, decay_every=18_125, validate_every=18_125),
             depth=TrainConfig(
                 steps=30_625 * 20,

@@ -1,6 +1,6 @@
 """From image columns to map rays: the transformer of one depth band.
 
-Paper, Eqs. 3 and 4, and supplement, "FPV to BEV transformers".
+Paper, Section 3.1, Eqs. 3 and 4, and supplement, "FPV to BEV transformers".
 
 Columns are independent of each other and form the batch: N = B * C sequences of R image rows become N sequences of P
 ray positions. The sequences are short, so attention is two plain matrix products, and its weights are returned.

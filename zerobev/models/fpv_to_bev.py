@@ -63,7 +63,7 @@ class FpvToBev(nn.Module):
 
 
 def reweigh(cross: Tensor, values: Tensor) -> Tensor:
-    """Cross-attention with identity values (paper, Eq. 8): image columns summed with the weights of another stream.
+    """Cross-attention with identity values (paper, Eq. 7): image columns summed with the weights of another stream.
 
     The channels are divided among the heads, as in other multi-head attention.
 

@@ -1,4 +1,4 @@
-"""Zero-BEV with the inductive bias (paper, Section 3.4, Eqs. 7 and 8; supplement, "Zero-BEV with inductive bias").
+"""Zero-BEV with the inductive bias (paper, Section 3.4, Eqs. 6 and 7; supplement, "Zero-BEV with inductive bias").
 
 RGB image -> backbone -> pyramid -> transformers ---> map features -> U-Net -> auxiliary logits
                                          : attention                    = (shared weights)

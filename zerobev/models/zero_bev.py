@@ -24,6 +24,7 @@ from zerobev.models.pyramid import FeaturePyramid
 class ZeroBEV(BevModel):
     """Zero-BEV (paper, Fig. 2c; with `residual` 2d): project any zero-shot image to the map, given the RGB image.
 
+    Eq. 5 concatenates the two images; as in the supplement, the two feature maps of each stride are concatenated here.
     RGB features are computed once. Each zero-shot image then has a separate pass through the zero CNN and all later
     parts, so its map does not depend on other images. The auxiliary logits are the mean over these passes (one pass in
     training), and do not depend on the order of images.

@@ -1,8 +1,10 @@
 """Numbers of rooms, objects and classes in scenes, and the same numbers for HM3DSem.
 
-The reference `HM3DSEM` describes the 181 annotated scenes of HM3DSem v0.2 with 2,599 rooms, the regions of their
-`.semantic.txt` files. HM3DSem's scenes are larger than generated homes: 5, 50 and 95 % of them have up to 42, 92 and
-242 m2 of navigable floor, flats 23, 41 and 57 m2, varied homes 22, 49 and 99 m2.
+The reference `HM3DSEM` was counted in the `.semantic.txt` files of the 181 annotated scenes of HM3DSem v0.2 (Yadav et
+al., "Habitat-Matterport 3D Semantics Dataset", CVPR 2023), which are not part of this repository. Its 2,599 rooms are
+their regions; the kind of a room follows from its objects, since the files do not name kinds. HM3DSem's scenes are
+larger than generated homes: 5, 50 and 95 % of them have up to 42, 92 and 242 m2 of navigable floor, flats 23, 41 and
+57 m2, varied homes 22, 49 and 99 m2.
 """
 
 from collections import Counter

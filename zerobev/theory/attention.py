@@ -1,4 +1,4 @@
-"""The two-stream cross-attention of the paper's Eqs. 7 and 8 without a network, and its training on the aux stream."""
+"""The two-stream cross-attention of the paper's Eqs. 6 and 7 without a network, and its training on the aux stream."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -17,7 +17,7 @@ Stream = Callable[[Tensor, Tensor], Tensor]
 
 
 class CrossAttention(nn.Module):
-    """One layer with one head (paper, Eqs. 3 and 4); two streams of values share its attention (Eqs. 7 and 8).
+    """One layer with one head (paper, Eqs. 3 and 4); two streams of values share its attention (Eqs. 6 and 7).
 
     Each position has a trained query, in place of W_Q on a positional encoding. No backbone, feed-forward layer or
     normalisation.
@@ -40,11 +40,11 @@ class CrossAttention(nn.Module):
         return self.logits(features).softmax(-1)
 
     def aux(self, features: Tensor, values: Tensor) -> Tensor:
-        """Eq. 7: values (N, R, A) -> rays (N, P, A')."""
+        """Eq. 6: values (N, R, A) -> rays (N, P, A')."""
         return self.attention(features) @ (values if self.value is None else values @ self.value)
 
     def zero(self, features: Tensor, values: Tensor) -> Tensor:
-        """Eq. 8: values (N, R, K) of any modalities -> rays (N, P, K)."""
+        """Eq. 7: values (N, R, K) of any modalities -> rays (N, P, K)."""
         return self.attention(features) @ values
 
 
