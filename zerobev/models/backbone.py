@@ -1,8 +1,8 @@
 """Feature extractors on the first-person side: the ResNet of the RGB image and the small CNN of the zero-shot image.
 
 Paper, supplement, "Feature extractor". Both give four maps per image at the same four strides, to be concatenated
-(Eq. 5 concatenates the images themselves).
-Every layer reduces a size n to ceil(n / 2), so both extractors agree at odd sizes, too.
+(Eq. 5 concatenates the images themselves). Every layer reduces a size n to ceil(n / 2), so both extractors agree at odd
+sizes, too.
 """
 
 from itertools import pairwise

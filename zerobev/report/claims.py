@@ -14,7 +14,7 @@ from zerobev.common.errors import InputError
 from zerobev.config import LABELS
 from zerobev.evaluation.metrics import DRAWS, INTERVAL, Statistic, class_iou, iou_per_class, pixel_iou, resampled_scenes
 from zerobev.experiments.run_records import RunRecord
-from zerobev.report.paper import TABLES, Ordering, Ratio, Row, Similar
+from zerobev.report.paper import CLAIMS, TABLES, Ordering, Ratio, Row, Similar
 
 _OBJECTS = [LABELS.index(name) for name in LABELS if name not in ("wall", "floor")]
 
@@ -49,13 +49,13 @@ def judge(claim: Ordering | Similar, records: Sequence[RunRecord]) -> Verdict:
 
     Raises `InputError` for records of different test scenes.
     """
-    rows, measure = _measured(claim)
-    published = TABLES.get(claim.table, {})
+    rows, measure = _judged(claim)
+    of_paper = TABLES.get(claim.table, {})
     paper = None
-    if set(rows) <= set(published):
-        paper = round(float(measure(np.array([_published(published[row], claim.metric) for row in rows]))), 1)
+    if set(rows) <= set(of_paper):
+        paper = round(float(measure(np.array([published(of_paper[row], claim.metric) for row in rows]))), 1)
     text = f"{_named(claim)}: {claim.text}"
-    found = _measure(rows, claim.metric, measure, records)
+    found = measured(rows, claim.metric, measure, records)
     if found is None:
         return Verdict(claim.id, claim.table, text, paper, None, None, None, "not run")
     ours, low, high = (round(100 * value, 1) for value in found)
@@ -68,16 +68,23 @@ def judge(claim: Ordering | Similar, records: Sequence[RunRecord]) -> Verdict:
     return Verdict(claim.id, claim.table, text, paper, ours, low, high, verdict)
 
 
+def limit_of(verdict: Verdict) -> float | None:
+    """The limit of a verdict on a spread, IoU points; None for a verdict on an ordering."""
+    claims = {claim.id: claim for claim in CLAIMS}
+    claim = claims.get(verdict.id)
+    return claim.points if isinstance(claim, Similar) else None
+
+
 def compare(ratio: Ratio, records: Sequence[RunRecord]) -> dict[str, str | float | None]:
     """A quotient of two rows in the paper and here, with our 90 % interval; None if a row has no record."""
     rows = (ratio.numerator, ratio.denominator)
-    published = [_published(TABLES[1][row], ratio.metric) for row in rows]
-    found = _measure(rows, ratio.metric, lambda values: values[..., 0] / values[..., 1], records)
+    of_paper = [published(TABLES[1][row], ratio.metric) for row in rows]
+    found = measured(rows, ratio.metric, lambda values: values[..., 0] / values[..., 1], records)
     ours, low, high = (None, None, None) if found is None else (round(value, 3) for value in found)
-    return {**asdict(ratio), "paper": round(published[0] / published[1], 3), "ours": ours, "low": low, "high": high}
+    return {**asdict(ratio), "paper": round(of_paper[0] / of_paper[1], 3), "ours": ours, "low": low, "high": high}
 
 
-def _measured(claim: Ordering | Similar) -> tuple[tuple[str, ...], Measure]:
+def _judged(claim: Ordering | Similar) -> tuple[tuple[str, ...], Measure]:
     """The rows of a claim, and the number to be judged."""
     if isinstance(claim, Ordering):
         return (claim.better, claim.worse), lambda values: values[..., 0] - values[..., 1]
@@ -90,10 +97,14 @@ def _named(claim: Ordering | Similar) -> str:
     return f"{', '.join(f'({row})' for row in claim.rows)} within {claim.points} points, {claim.metric} IoU"
 
 
-def _measure(
+def measured(
     rows: Sequence[str], metric: str, measure: Measure, records: Sequence[RunRecord]
 ) -> tuple[float, float, float] | None:
-    """The measured value and the ends of its interval; None if a row has no record."""
+    """A number of several rows and the ends of its 90 % interval, IoU in [0, 1]; None if a row has no record.
+
+    metric: see `zerobev.report.paper.Claim`
+    Raises `InputError` for records of different test scenes.
+    """
     runs = {row: [record for record in records if record.row == row] for row in rows}
     if not all(runs.values()):
         return None
@@ -107,7 +118,8 @@ def _measure(
     return float(whole), float(low), float(high)
 
 
-def _published(row: Row, metric: str) -> float:
+def published(row: Row, metric: str) -> float:
+    """The paper's IoU of a row, in percent; for "objects" the mean over the six object classes."""
     if metric in LABELS:
         return row.per_class[LABELS.index(metric)]
     if metric == "objects":

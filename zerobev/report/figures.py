@@ -1,11 +1,16 @@
 """Figures of the notebooks and the page of results."""
 
+import re
 from collections.abc import Collection, Mapping, Sequence
+from textwrap import fill
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from zerobev.config import LABELS, NO_LABEL, CameraConfig
@@ -13,20 +18,31 @@ from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
 from zerobev.experiments.run_records import RunRecord
 from zerobev.geometry.cameras import Pose
 from zerobev.rendering.gbuffer import RayCaster
+from zerobev.report.claims import Verdict, limit_of
+from zerobev.report.names import named
 from zerobev.report.paper import TABLES
 from zerobev.report.tables import rows_of
 from zerobev.scenes.scene import Scene
 
-#: One colour per class, in the order of `LABELS`.
-COLORS = ("#4c566a", "#c9b79c", "#e07a1f", "#3a7d44", "#2f6db5", "#7cc36e", "#b04fb0", "#d62839")
-#: (9, 3) uint8: these, then light grey for `NO_LABEL`.
-_PALETTE = (255 * to_rgba_array([*COLORS, "#ececec"])[:, :3]).round().astype(np.uint8)
+#: One colour per class, in the order of `LABELS`; the hues of Okabe and Ito, which colour-blind readers can tell apart.
+COLORS = ("#3b3b3b", "#e3cf8f", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#56b4e9", "#e69f00")
+#: Cells of no class, and cells outside the field of view.
+NOTHING, OUTSIDE = "#ffffff", "#9aa0a6"
+OURS, PAPER = COLORS[4], COLORS[2]
+#: (10, 3) uint8: classes, outside, nothing (`NO_LABEL`, the last).
+_PALETTE = (255 * to_rgba_array([*COLORS, OUTSIDE, NOTHING])[:, :3]).round().astype(np.uint8)
 
 
 def label_image(label: np.ndarray, fov: np.ndarray | None = None) -> np.ndarray:
-    """(H, W) labels -> (H, W, 3) uint8 colours; white outside `fov`."""
+    """(H, W) labels -> (H, W, 3) uint8 colours; grey outside `fov`, white for no class."""
     image = _PALETTE[label]
-    return image if fov is None else np.where(fov[..., None], image, np.uint8(255))
+    return image if fov is None else np.where(fov[..., None], image, _PALETTE[len(COLORS)])
+
+
+def mask_image(mask: np.ndarray, fov: np.ndarray, color: str = "#ffffff", ground: str = "#000000") -> np.ndarray:
+    """(M, M) bool -> (M, M, 3) uint8: one colour on a ground of another, grey outside `fov`."""
+    palette = (255 * to_rgba_array([ground, color, OUTSIDE])[:, :3]).round().astype(np.uint8)
+    return palette[np.where(fov, mask.astype(int), 2)]
 
 
 def maps_image(maps: np.ndarray, fov: np.ndarray) -> np.ndarray:
@@ -44,24 +60,77 @@ def flat(masks: np.ndarray) -> np.ndarray:
 
 
 def averages_figure(number: int, records: Sequence[RunRecord]) -> Figure:
-    """Both averages per row of a table: ours with 90 % intervals over scenes and seeds, the paper's as crosses."""
+    """Both averages per row of a table: ours with 90 % intervals over scenes and seeds, the paper's as crosses.
+
+    Axes do not begin at zero, so that small differences are visible.
+    """
     rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
-    figure, panels = plt.subplots(1, 2, figsize=(8, 0.9 + 0.28 * len(rows)), sharey=True)
+    figure, panels = plt.subplots(1, 2, figsize=(9, 1.3 + 0.3 * len(rows)), sharey=True)
     for axes, (name, statistic) in zip(panels, {"class": class_iou, "pixel": pixel_iou}.items()):
         for y, row in enumerate(rows):
             counts = [record.counts for record in records if record.row == row]
             low, high = bootstrap_interval(counts, statistic, np.random.default_rng(0))
             mean = np.mean([one.value(statistic) for one in counts])
-            axes.plot([100 * low, 100 * high], [y, y], color=COLORS[4], linewidth=3, alpha=0.5)
-            axes.plot(100 * mean, y, "o", color=COLORS[4])
-            if (published := TABLES.get(number, {}).get(row)) is not None:
-                axes.plot(published.class_iou if name == "class" else published.pixel_iou, y, "x", color=COLORS[0])
-        axes.set(xlabel=f"{name} IoU [%]", xlim=(0, None))
+            axes.plot([100 * low, 100 * high], [y, y], color=OURS, linewidth=3, alpha=0.5)
+            ours = axes.plot(100 * mean, y, "o", color=OURS, clip_on=False)
+            if (of_paper := TABLES.get(number, {}).get(row)) is not None:
+                value = of_paper.class_iou if name == "class" else of_paper.pixel_iou
+                paper = axes.plot(value, y, "x", color=PAPER, markeredgewidth=2, clip_on=False)
+        axes.set(xlabel=f"{name} IoU [%]", ylim=(len(rows) - 0.5, -0.5))
+        axes.margins(x=0.08)
         axes.grid(axis="x", alpha=0.3)
-    panels[0].set_yticks(range(len(rows)), [f"({row})" for row in rows])
-    panels[0].invert_yaxis()
+    panels[0].set_yticks(range(len(rows)), [named(row) for row in rows])
+    marks = {"ours, 90 % interval": ours} | ({"the paper's": paper} if number in TABLES else {})
+    figure.tight_layout()
+    handles = [mark[0] for mark in marks.values()]
+    figure.legend(handles, list(marks), fontsize=9, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False)
+    return figure
+
+
+_MARKS = {"holds": ("o", OURS), "undecided": ("D", "#8c8c8c"), "does not hold": ("s", PAPER)}
+
+
+def scoreboard_figure(verdicts: Sequence[Verdict]) -> Figure:
+    """Difference per claim, in IoU points: ours with its 90 % interval, the paper's as a cross; blue bars are limits.
+
+    The axis is linear up to 2 points and logarithmic beyond, so that tenths of a point are visible beside tens.
+    """
+    shown = sorted((v for v in verdicts if v.ours is not None), key=lambda v: v.table)
+    tables = [v.table for v in shown]
+    figure, axes = plt.subplots(figsize=(10, 1.2 + 0.27 * len(shown)))
+    axes.axvline(0, color="black", linewidth=0.8)
+    for y, v in enumerate(shown):
+        assert v.ours is not None and v.low is not None and v.high is not None  # as selected above
+        marker, color = _MARKS[v.verdict]
+        if (limit := limit_of(v)) is not None:
+            axes.plot([0, limit], [y, y], color=COLORS[6], linewidth=9, alpha=0.4, solid_capstyle="butt")
+        axes.plot([v.low, v.high], [y, y], color=color, linewidth=2)
+        axes.plot(v.ours, y, marker, color=color, markersize=6)
+        if v.paper is not None:
+            axes.plot(v.paper, y, "x", color="black", markersize=6)
+        if y and tables[y] != tables[y - 1]:
+            axes.axhline(y - 0.5, color="#cccccc", linewidth=0.8)
+    ticks = [-20, -5, -2, -1, 0, 1, 2, 5, 20]
+    axes.set_xscale("symlog", linthresh=2, linscale=1)
+    axes.set_xticks(ticks, [f"{tick:+d}" if tick else "0" for tick in ticks])
+    axes.minorticks_off()
+    axes.set_yticks(range(len(shown)), [f"{v.id}  {_short(v)}" for v in shown], fontsize=8)
+    axes.set(xlabel="difference or spread, IoU points", ylim=(len(shown) - 0.5, -0.5))
+    axes.margins(x=0.05)
+    marks: list[Artist] = [Line2D([], [], marker=m, color=c, label=f"ours: {name}") for name, (m, c) in _MARKS.items()]
+    marks += [Line2D([], [], marker="x", color="black", linestyle="", label="the paper's")]
+    marks += [Patch(color=COLORS[6], alpha=0.4, label="limit of a spread")]
+    axes.legend(handles=marks, fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.35, 1), frameon=False)
     figure.tight_layout()
     return figure
+
+
+def _short(verdict: Verdict) -> str:
+    """A claim in a few words: both rows by name and the metric, or the text of a claim on several rows."""
+    rows, _, text = verdict.claim.partition(": ")
+    if limit_of(verdict) is not None:
+        return f"{text}, {rows.rpartition(', ')[2]}"
+    return re.sub(r"\((.+?)\)", lambda found: f"{named(found[1], letter=False)} {found[0]}", rows)
 
 
 def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarray]) -> Figure:
@@ -72,10 +141,15 @@ def gallery_figure(views: Mapping[str, np.ndarray], maps: Mapping[str, np.ndarra
     """
     truth = [label_image(label, fov) for label, fov in zip(views["bev_label"], views["fov"])]
     predicted = [
-        (f"({row})", [maps_image(m, fov) for m, fov in zip(masks, views["fov"])]) for row, masks in maps.items()
+        (
+            f"({row})\n{fill(named(row, letter=False), 15, break_on_hyphens=False)}",
+            [maps_image(m, fov) for m, fov in zip(masks, views["fov"])],
+        )
+        for row, masks in maps.items()
     ]
     labels = [label_image(label) for label in views["fpv_label"]]
-    figure = grid([("photograph", views["rgb"]), ("FPV labels", labels), *predicted, ("truth", truth)], side=1.2)
+    figure = grid([("photograph", views["rgb"]), ("labels", labels), *predicted, ("true map", truth)], side=1.2)
+    add_scale(figure.axes[len(predicted) + 2], truth[0].shape[0])
     add_legend(figure)
     return figure
 
@@ -86,9 +160,11 @@ def grid(columns: Sequence[tuple[str, Collection[np.ndarray]]], side: float = 1.
     side: of an image, inches
     """
     rows = len(columns[0][1])
-    figure, axes = plt.subplots(rows, len(columns), figsize=(side * len(columns), side * rows + 0.3), squeeze=False)
+    lines = max(title.count("\n") + 1 for title, _ in columns)
+    size = (side * len(columns), side * rows + 0.1 + 0.2 * lines)
+    figure, axes = plt.subplots(rows, len(columns), figsize=size, squeeze=False)
     for j, (title, images) in enumerate(columns):
-        axes[0, j].set_title(title, fontsize=8)
+        axes[0, j].set_title(title, fontsize=9)
         for i, image in enumerate(images):
             axes[i, j].imshow(image, cmap="gray", interpolation="nearest")
             axes[i, j].set_axis_off()
@@ -97,9 +173,18 @@ def grid(columns: Sequence[tuple[str, Collection[np.ndarray]]], side: float = 1.
 
 
 def add_legend(figure: Figure) -> None:
-    """Add the eight classes and their colours below a figure."""
-    patches = [Patch(color=color, label=name) for name, color in zip(LABELS, COLORS)]
-    figure.legend(handles=patches, loc="lower center", ncols=len(LABELS), fontsize=7, bbox_to_anchor=(0.5, -0.04))
+    """Add the eight classes, "no class" and "outside the view" with their colours below a figure."""
+    entries = [*zip(LABELS, COLORS), ("no class", NOTHING), ("outside the view", OUTSIDE)]
+    patches = [Patch(facecolor=color, edgecolor="#777777", linewidth=0.5, label=name) for name, color in entries]
+    ncols = 10 if figure.get_figwidth() > 8 else 5
+    figure.legend(handles=patches, loc="upper center", ncols=ncols, fontsize=9, bbox_to_anchor=(0.5, 0.0))
+
+
+def add_scale(axes: Axes, cells: int, extent_m: float = CameraConfig(fpv_px=1, bev_px=1).bev_extent_m) -> None:
+    """Draw a bar of 1 m into a map of `cells` x `cells` cells that is `extent_m` wide."""
+    right, low = 0.95 * cells, 0.94 * cells
+    axes.plot([right - cells / extent_m, right], [low, low], color="black", linewidth=2)
+    axes.text(right - cells / extent_m / 2, low - 0.02 * cells, "1 m", ha="center", va="bottom", fontsize=8)
 
 
 def top_view(scene: Scene) -> tuple[np.ndarray, tuple[float, float, float, float]]:

@@ -262,7 +262,8 @@ def refresh(notebooks: Path = NOTEBOOKS, reports: Path = PACKAGE_PARENT / "repor
             copy = execute(notebook, cache / notebook.name, cache, {})
             copy.metadata = {"kernelspec": copy.metadata.kernelspec, "language_info": {"name": "python"}}
             for cell in copy.cells:
-                cell.metadata = {"tags": cell.metadata.tags} if cell.metadata.get("tags") else {}
+                kept = ("tags", "jupyter")  # "jupyter" folds the solutions of exercises
+                cell.metadata = {name: cell.metadata[name] for name in kept if cell.metadata.get(name)}
             with replacing(notebook) as clean:
                 nbformat.write(copy, clean)
     picture = first_picture(nbformat.read(_notebooks_in(notebooks)[0], as_version=4))

@@ -1,5 +1,6 @@
 """Tables of the notebooks and the page of results, from records and the paper's numbers."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -71,9 +72,9 @@ def verdict_table(verdicts: Sequence[Verdict]) -> pd.DataFrame:
 
 
 def scoreboard(verdicts: Sequence[Verdict]) -> Markdown:
-    """All claims with verdicts and links to their notebooks; differences in IoU points."""
+    """All claims by table, with verdicts and links to their notebooks; differences in IoU points."""
     lines = ["| | claim | paper | ours | 90 % interval | verdict | |", "|---|---|---|---|---|---|---|"]
-    for v in verdicts:
+    for v in sorted(verdicts, key=lambda v: v.table):
         paper, ours = ("" if value is None else f"{value:+.1f}" for value in (v.paper, v.ours))
         interval = "" if v.low is None else f"{v.low:+.1f} to {v.high:+.1f}"
         link = f"[notebook {int(NOTEBOOKS[v.table][:2])}]({NOTEBOOKS[v.table]}.ipynb)"
@@ -81,21 +82,42 @@ def scoreboard(verdicts: Sequence[Verdict]) -> Markdown:
     return Markdown("\n".join(lines))
 
 
+def counted(verdicts: Sequence[Verdict]) -> str:
+    """The number of claims per verdict, such as "9 hold, 7 are undecided, 3 do not hold"."""
+    words = {"holds": "hold", "undecided": "are undecided", "does not hold": "do not hold", "not run": "are not run"}
+    numbers = {word: sum(v.verdict == name for v in verdicts) for name, word in words.items()}
+    return ", ".join(f"{number} {word}" for word, number in numbers.items() if number)
+
+
+def order_of(value: float) -> str:
+    """A small number as the power of ten above it, which is the same on all machines; "0" for 0."""
+    return "0" if value == 0 else f"below 1e{math.floor(math.log10(abs(value))) + 1}"
+
+
 class Checks:
     """The checks of a notebook, for its closing table."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[str, str, str]] = []
+        self._rows: list[tuple[str, str, str, str]] = []
 
-    def holds(self, claim: str, expected: str, condition: bool) -> None:
-        """Assert `condition`, which must hold on any machine, and note it."""
-        assert condition, f"{claim}: expected {expected}"
-        self._rows.append((claim, expected, "holds"))
+    def holds(self, claim: str, expected: str, found: object, condition: bool) -> None:
+        """Assert `condition`, which must hold on any machine, and note it with the value that was found."""
+        assert condition, f"{claim}: expected {expected}, found {found}"
+        self._rows.append((claim, expected, str(found), "holds"))
 
-    def note(self, claim: str, expected: str, verdict: str) -> None:
-        """Note the verdict on a claim that may or may not hold."""
-        self._rows.append((claim, expected, verdict))
+    def note(self, claim: str, expected: str, found: object, verdict: str | bool) -> None:
+        """Note the verdict on a claim that may or may not hold, with the value that was found."""
+        if isinstance(verdict, bool | np.bool_):
+            verdict = "holds" if verdict else "does not hold"
+        self._rows.append((claim, expected, str(found), verdict))
+
+    def judged(self, verdicts: Sequence[Verdict]) -> None:
+        """Note verdicts on claims about tables: the paper's number as expectation, ours with its interval."""
+        for v in verdicts:
+            expected = "above zero" if v.paper is None else f"{v.paper:+.1f} points in the paper"
+            found = "" if v.ours is None else f"{v.ours:+.1f} points ({v.low:+.1f} to {v.high:+.1f})"
+            self.note(v.claim, expected, found, v.verdict)
 
     def table(self) -> pd.DataFrame:
-        """Claim, expectation and verdict of each check."""
-        return pd.DataFrame(self._rows, columns=["claim", "expected", "verdict"]).set_index("claim")
+        """Claim, expectation, value and verdict of each check."""
+        return pd.DataFrame(self._rows, columns=["claim", "expected", "found", "verdict"]).set_index("claim")

@@ -2,18 +2,32 @@
 
 import re
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.text import Text
 
 from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.evaluation.metrics import Counts
 from zerobev.report.claims import judge
-from zerobev.report.figures import COLORS, flat, label_image, maps_image, top_view
-from zerobev.report.own_rows import OWN_CLAIMS
+from zerobev.report.figures import (
+    COLORS,
+    OUTSIDE,
+    averages_figure,
+    flat,
+    gallery_figure,
+    label_image,
+    maps_image,
+    mask_image,
+    scoreboard_figure,
+    top_view,
+)
+from zerobev.report.names import NAMES, named
+from zerobev.report.own_rows import OWN_CLAIMS, OWN_ROWS
 from zerobev.report.paper import CLAIMS, TABLES
-from zerobev.report.tables import Checks, scoreboard, table, verdict_table
+from zerobev.report.tables import Checks, counted, order_of, rows_of, scoreboard, table, verdict_table
 
 from support.paths import ROOT
 from support.records import record, run_record
@@ -99,10 +113,46 @@ def test_colors_of_labels():
     image = label_image(label)
     assert image.dtype == np.uint8 and image.shape == (1, 9, 3)
     assert [tuple(color) for color in image[0, :8].tolist()] == [rgb(color) for color in COLORS]
-    assert len({tuple(color) for color in image[0].tolist()} | {(255, 255, 255)}) == 10
+    assert len({tuple(color) for color in image[0].tolist()} | {rgb(OUTSIDE)}) == 10
     inside = np.arange(9)[None] % 2 == 0
     masked = label_image(label, inside)
-    assert (masked[~inside] == 255).all() and np.array_equal(masked[inside], image[inside])
+    assert (masked[~inside] == rgb(OUTSIDE)).all() and np.array_equal(masked[inside], image[inside])
+
+
+def test_colors_of_masks():
+    image = mask_image(np.array([[True, False, True, False]]), np.array([[True, True, False, False]]), "#ff0000")
+    assert image[0].tolist() == [[255, 0, 0], [0, 0, 0], [*rgb(OUTSIDE)], [*rgb(OUTSIDE)]]
+
+
+def test_no_marker_and_no_text_of_the_figures_is_lost():
+    """Text has at least 8 points, markers lie inside the axes, and the legend names every colour."""
+    base = np.linspace(20, 40, 6)[:, None] + np.zeros(8)
+    records = [record(row, base + shift) for row, shift in (("c", 0.0), ("d.I", 0.4), ("d", 60.0))]
+    verdicts = [judge(claim, records) for claim in CLAIMS]
+    views = {"rgb": np.zeros((1, 4, 4, 3), np.uint8), "fpv_label": np.zeros((1, 4, 4), int)}
+    views |= {"bev_label": np.zeros((1, 4, 4), int), "fov": np.ones((1, 4, 4), bool)}
+    gallery = gallery_figure(views, {"c": np.zeros((1, 8, 4, 4), bool)})
+    for figure in (averages_figure(2, records), scoreboard_figure(verdicts), gallery):
+        figure.draw_without_rendering()
+        assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= 8
+        for axes in figure.axes:
+            (left, right), (bottom, top) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
+            for line in axes.lines:
+                if line.get_marker() not in ("None", None, ""):
+                    x, y = (np.asarray(values, float) for values in line.get_data())
+                    assert ((left <= x) & (x <= right) & (bottom <= y) & (y <= top)).all()
+    assert [text.get_text() for text in gallery.legends[0].get_texts()] == [*LABELS, "no class", "outside the view"]
+    plt.close("all")
+
+
+def test_every_row_of_a_table_has_a_name():
+    assert {row for number in (*TABLES, *OWN_ROWS) for row in rows_of(number)} == set(NAMES)
+    assert (named("c"), named("c", letter=False), named("x"), named("x", letter=False)) == (
+        "(c) Zero-BEV",
+        "Zero-BEV",
+        "(x)",
+        "(x)",
+    )
 
 
 def test_maps_are_drawn_like_labels_with_the_floor_below():
@@ -130,20 +180,43 @@ def test_top_view_is_in_world_metres():
 
 def test_checks_note_claims_that_hold_and_raise_for_others():
     checks = Checks()
-    checks.holds("sum", "2", 1 + 1 == 2)
-    checks.note("order", "c > d", "undecided")
-    with pytest.raises(AssertionError, match="product: expected 5"):
-        checks.holds("product", "5", False)
+    checks.holds("sum", "2", 1 + 1, 1 + 1 == 2)
+    checks.note("order", "c > d", "c = d", "undecided")
+    checks.note("size", "above 3", 2, 2 > 3)
+    with pytest.raises(AssertionError, match="product: expected 5, found 6"):
+        checks.holds("product", "5", 6, False)
     expected = pd.DataFrame(
-        {"expected": ["2", "c > d"], "verdict": ["holds", "undecided"]}, index=pd.Index(["sum", "order"], name="claim")
+        {
+            "expected": ["2", "c > d", "above 3"],
+            "found": ["2", "c = d", "2"],
+            "verdict": ["holds", "undecided", "does not hold"],
+        },
+        index=pd.Index(["sum", "order", "size"], name="claim"),
     )
     pd.testing.assert_frame_equal(checks.table(), expected, check_dtype=False)
+
+
+def test_checks_show_the_numbers_of_verdicts():
+    base = np.full((6, 8), 30.0)
+    checks = Checks()
+    checks.judged([judge(claim, [record("c", base), record("d", base + 5)]) for claim in CLAIMS[4:6]])
+    lines = checks.table().to_numpy().tolist()
+    assert lines[0] == ["+3.5 points in the paper", "+5.0 points (+5.0 to +5.0)", "holds"]
+    assert lines[1] == ["+3.0 points in the paper", "", "not run"]
+
+
+@pytest.mark.parametrize("value, text", [(0, "0"), (3e-7, "below 1e-6"), (-0.02, "below 1e-1"), (1e-6, "below 1e-5")])
+def test_order_of_a_small_number(value, text):
+    assert order_of(value) == text
 
 
 def test_scoreboard_links_every_claim_to_an_existing_notebook():
     verdicts = [judge(claim, [record("c", [[30.0] * 8] * 3)]) for claim in (*CLAIMS, *OWN_CLAIMS)]
     _, _, *lines = scoreboard(verdicts).data.splitlines()
-    assert [line.split("|")[1].strip() for line in lines] == [verdict.id for verdict in verdicts]
+    ids = [line.split("|")[1].strip() for line in lines]
+    assert sorted(ids) == sorted(verdict.id for verdict in verdicts)
+    assert [id.split(".")[0] for id in ids] == sorted(id.split(".")[0] for id in ids)
+    assert counted(verdicts) == f"{len(verdicts)} are not run"
     for line in lines:
         (link,) = re.findall(r"\]\((.*?)\)", line)
         assert (ROOT / "notebooks" / link).is_file()
