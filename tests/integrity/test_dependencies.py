@@ -24,7 +24,7 @@ GROUP_OF = {
     **dict.fromkeys(["common.locks", "training", "experiments", "benchmarks", "report"], "workbook"),
 }
 #: Commands and plug-ins without an import.
-TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "setuptools"}
+TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "codespell", "setuptools"}
 
 
 def requirements(group: str) -> dict[str, Requirement]:

@@ -115,7 +115,7 @@ def contains_no_machine_paths(notebook: NotebookNode) -> None:
 
 def cells_are_short(notebook: NotebookNode) -> None:
     lines = [len(cell.source.splitlines()) for cell in code_cells(notebook)]
-    assert statistics.median(lines) <= 5 and max(lines) <= 25
+    assert statistics.median(lines) <= 6 and max(lines) <= 25
 
 
 def prose_precedes_every_code_cell(notebook: NotebookNode) -> None:
@@ -138,8 +138,27 @@ def every_link_is_a_file(notebook: NotebookNode) -> None:
         assert (ROOT / "notebooks" / link).is_file(), link
 
 
+def sections(notebook: NotebookNode) -> list[str]:
+    """The headings of second level."""
+    texts = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+    return [line[3:] for text in texts for line in text.splitlines() if line.startswith("## ")]
+
+
 def ends_with_a_table_of_checks(notebook: NotebookNode) -> None:
-    assert "What we checked" in [cell for cell in notebook.cells if cell.cell_type == "markdown"][-1].source
+    """Only exercises follow it."""
+    assert [name for name in sections(notebook) if name != "Exercises"][-1:] == ["What we checked"]
+
+
+def exercises_have_a_hint_and_a_folded_solution(notebook: NotebookNode) -> None:
+    """Two or three exercises, if there are any; each is a question with a hint, then a hidden cell."""
+    if "Exercises" not in sections(notebook):
+        return
+    (start,) = [i for i, cell in enumerate(notebook.cells) if cell.source.startswith("## Exercises")]
+    questions, solutions = notebook.cells[start::2], notebook.cells[start + 1 :: 2]
+    assert len(questions) == len(solutions) in (2, 3)
+    for number, (question, solution) in enumerate(zip(questions, solutions), start=1):
+        assert f"**{number}.**" in question.source and "<details><summary>Hint</summary>" in question.source
+        assert solution.cell_type == "code" and solution.metadata.get("jupyter", {}).get("source_hidden")
 
 
 CHECKS = (
@@ -155,6 +174,7 @@ CHECKS = (
     states_its_time,
     every_link_is_a_file,
     ends_with_a_table_of_checks,
+    exercises_have_a_hint_and_a_folded_solution,
 )
 
 
@@ -176,6 +196,12 @@ def test_few_outputs_are_ignored():
 # Tests of the checks: a sound notebook passes all checks, and each spoiled copy fails its own.
 
 
+def exercise(number: int, heading: str = "") -> list[NotebookNode]:
+    question = f"{heading}**{number}.** {'word ' * 30}<details><summary>Hint</summary>word</details>"
+    folded = {"jupyter": {"source_hidden": True}}
+    return [new_markdown_cell(question), new_code_cell("2", execution_count=3 + number, metadata=folded)]
+
+
 def sound_notebook() -> NotebookNode:
     buffer = io.BytesIO()
     Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(buffer, "png")
@@ -190,6 +216,8 @@ def sound_notebook() -> NotebookNode:
             new_code_cell("figure = grid(SCALE)", execution_count=2, outputs=[new_output("display_data", figure)]),
             new_markdown_cell("## What we checked\n" + prose),
             new_code_cell("1", execution_count=3, outputs=[new_output("execute_result", {"text/plain": "1"})]),
+            *exercise(1, "## Exercises\n"),
+            *exercise(2),
         ],
     )
 
@@ -225,13 +253,17 @@ SPOILED = (
     (contains_no_machine_paths, set_source(5, 'open("../homes")')),
     (contains_no_machine_paths, set_output(5, new_output("stream", text="in /tmp/kernel_1"))),
     (cells_are_short, set_source(5, "1\n" * 26)),
-    (cells_are_short, lambda notebook: [cell.update(source="1\n" * 6) for cell in code_cells(notebook)]),
+    (cells_are_short, lambda notebook: [cell.update(source="1\n" * 7) for cell in code_cells(notebook)]),
     (prose_precedes_every_code_cell, lambda notebook: notebook.cells.pop(2)),
     (prose_precedes_every_code_cell, lambda notebook: [cell.update(source="Now:") for cell in notebook.cells[::2]]),
     (states_its_time, set_source(0, "Zero-BEV")),
     (every_link_is_a_file, set_source(0, "[gone](99_gone.ipynb)")),
     (every_link_is_a_file, set_output(5, new_output("display_data", {"text/html": "<a href='99.ipynb'>9</a>"}))),
     (ends_with_a_table_of_checks, set_source(4, "The end.")),
+    (ends_with_a_table_of_checks, set_source(8, "## More")),
+    (exercises_have_a_hint_and_a_folded_solution, lambda notebook: notebook.cells[7].metadata.clear()),
+    (exercises_have_a_hint_and_a_folded_solution, set_source(8, "**2.** No hint")),
+    (exercises_have_a_hint_and_a_folded_solution, lambda notebook: notebook.cells.__delitem__(slice(8, 10))),
 )
 
 
@@ -258,9 +290,33 @@ def test_ignored_outputs_are_counted(tag: str):
 def test_readme_and_tour_link_to_every_notebook():
     readme = links((ROOT / "README.md").read_text())
     assert {f"notebooks/{path.name}" for path in NOTEBOOKS} <= readme
-    assert all((ROOT / link).exists() for link in readme)
     tour = links(nbformat.read(NOTEBOOKS[0], as_version=4).cells[0].source)
     assert tour == {path.name for path in NOTEBOOKS[1:]}
+
+
+@pytest.mark.parametrize("number", range(len(NOTEBOOKS)))
+def test_a_notebook_links_to_its_neighbours(number: int):
+    last = nbformat.read(NOTEBOOKS[number], as_version=4).cells[0].source.splitlines()[-1]
+    neighbours = [NOTEBOOKS[number - 1].name] if number else []
+    neighbours += [path.name for path in NOTEBOOKS[number + 1 : number + 2]]
+    assert links(last) == {*neighbours, *([NOTEBOOKS[0].name] if number else [])}
+
+
+def anchors(markdown: str) -> set[str]:
+    """The names that GitHub gives to headings."""
+    headings = re.findall(r"^#+ (.+)$", markdown, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_links_of_the_documents_lead_somewhere(name: str):
+    text = (ROOT / name).read_text()
+    assert all((ROOT / link).exists() for link in links(text))
+    assert set(re.findall(r"\]\(#([^)]+)\)", text)) <= anchors(text)
+
+
+def test_anchors_are_those_of_github():
+    assert anchors("# Your own: image?\ntext\n## A-b c") == {"your-own-image", "a-b-c"}
 
 
 def test_the_readme_shows_the_tours_first_picture():

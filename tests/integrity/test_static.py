@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
 
 from support.paths import ROOT
@@ -20,6 +21,20 @@ def test_the_checkers_find_nothing(command: str):
     name, *arguments = command.split()
     checker = Path(sys.executable).with_name(name)
     found = subprocess.run([checker, *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
+def test_the_spelling_is_right():
+    """Of code, documents and the Markdown of notebooks; its settings are in pyproject.toml."""
+    checker = Path(sys.executable).with_name("codespell")
+    found = subprocess.run([checker], cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout + found.stderr
+    prose = "\n".join(
+        cell.source
+        for path in sorted((ROOT / "notebooks").glob("*.ipynb"))
+        for cell in nbformat.read(path, as_version=4).cells
+    )
+    found = subprocess.run([checker, "-"], cwd=ROOT, input=prose, capture_output=True, text=True)
     assert found.returncode == 0, found.stdout + found.stderr
 
 

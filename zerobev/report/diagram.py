@@ -57,10 +57,10 @@ def stages(network: nn.Module, *inputs: Tensor) -> list[Stage]:
 def draw_networks(networks: Sequence[tuple[str, Sequence[Stage]]]) -> Figure:
     """One line of boxes per network, with its title; a box shows name, parameters, and channels x rows x columns."""
     longest = max(len(blocks) for _, blocks in networks)
-    size = (1.75 * longest, 1.65 * len(networks))
+    size = (1.9 * longest, 1.75 * len(networks))
     figure, axes = plt.subplots(len(networks), figsize=size, squeeze=False, layout="constrained")
     for axis, (title, blocks) in zip(axes[:, 0], networks):
-        axis.set_title(title, fontsize=9, loc="left")
+        axis.set_title(title, fontsize=11, loc="left")
         axis.set(xlim=(-0.05, _STEP * longest), ylim=(0, 1))
         axis.set_axis_off()
         for index, block in enumerate(blocks):
@@ -78,4 +78,4 @@ def _box(axis: Axes, x: float, block: Stage) -> None:
     axis.add_patch(outline)
     lines = [" x ".join(map(str, shape)) for shape in block.shapes[:4]]
     text = "\n".join([block.name, f"{block.parameters / 1e6:.2f} M", *lines])
-    axis.text(x + 0.5, 0.5, text, ha="center", va="center", fontsize=7)
+    axis.text(x + 0.5, 0.5, text, ha="center", va="center", fontsize=10)

@@ -6,6 +6,7 @@ Reads the records of `reports/<report>/`; writes `index.html`, `tables/*.csv`, `
 
 import argparse
 import base64
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -28,10 +29,12 @@ from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunRecord, RunStore
 from zerobev.experiments.runs import SEEDS, recorded
 from zerobev.experiments.workspace import Workspace, add_workspace_arguments
-from zerobev.report.claims import VERDICTS, compare, judge
-from zerobev.report.figures import averages_figure, gallery_figure
+from zerobev.report.claims import VERDICTS, Verdict, compare, judge
+from zerobev.report.figures import averages_figure, gallery_figure, scoreboard_figure
+from zerobev.report.notebooks import NOTEBOOKS
 from zerobev.report.own_rows import OWN_CLAIMS
 from zerobev.report.paper import CLAIMS, RATIOS
+from zerobev.report.tables import NOTEBOOKS as NOTEBOOK_OF
 from zerobev.report.tables import cost_table, table
 
 #: number -> title; table 6 is not in the paper
@@ -39,9 +42,9 @@ TABLES = {
     1: "Table 1: zero-shot projection of semantic classes",
     2: "Table 2: variants of the network, and the max-pooling attention (f)",
     3: "Table 3: depth in training the residual variant",
-    4: "Table 4: share of white in the textures",
-    5: "Table 5: how the zero-shot stream is made",
-    6: "Beyond the paper: scale and freshness of the textures",
+    4: "Table 4: fraction of white in the textures",
+    5: "Table 5: how the training data are made",
+    6: "Table 6, not in the paper: size, surface and number of textures",
 }
 _SHOWN = ("a.1", "a.2", "b.3", "c", "d", "f", "f.r")  #: rows of the gallery, if they are recorded
 
@@ -65,7 +68,9 @@ def write_summary(workspace: Workspace) -> Path:
         rows=len({record.row for record in records}),
         seeds=sorted({record.seed for record in records}),
         counted={name: of_paper[name] for name in VERDICTS if of_paper[name]},
-        verdicts=verdicts,
+        verdicts=sorted(verdicts, key=lambda verdict: verdict.table),
+        scoreboard=_scoreboard(verdicts, folder),
+        notebooks={path.stem[:2]: _link(path, folder) for path in sorted(NOTEBOOKS.glob("*.ipynb"))},
         ratios=ratios,
         tables=[_table(number, frame, records, folder) for number, frame in tables.items()],
         gallery=_gallery(workspace, records),
@@ -95,6 +100,17 @@ def _template() -> jinja2.Template:
     return environment.get_template("page.html.j2")
 
 
+def _link(notebook: Path, folder: Path) -> str:
+    """A notebook of the checkout, relative to the page."""
+    return Path(os.path.relpath(notebook, folder)).as_posix()
+
+
+def _scoreboard(verdicts: Sequence[Verdict], folder: Path) -> Figure | None:
+    if all(verdict.ours is None for verdict in verdicts):
+        return None
+    return _save(scoreboard_figure(verdicts), folder, "claims", "Difference per claim, ours and the paper's")
+
+
 def _table(number: int, frame: pd.DataFrame, records: Sequence[RunRecord], folder: Path) -> dict[str, Any]:
     """A table for the page: number, title, columns, lines and figure."""
     lines = [
@@ -109,9 +125,13 @@ def _table(number: int, frame: pd.DataFrame, records: Sequence[RunRecord], folde
     mine = [record for record in records if record.row in frame.index.get_level_values("row")]
     figure = None
     if mine:
-        figure = _save(averages_figure(number, mine), folder, f"table{number}", "Averages, 90 % intervals")
+        figure = _save(
+            averages_figure(number, mine), folder, f"table{number}", f"Table {number}: both averages, 90 % intervals"
+        )
     columns = ("row", "method", "", *frame.columns)
-    return {"number": number, "title": TABLES[number], "columns": columns, "lines": lines, "figure": figure}
+    notebook = _link(NOTEBOOKS / f"{NOTEBOOK_OF[number]}.ipynb", folder)
+    parts = {"number": number, "title": TABLES[number], "columns": columns, "lines": lines, "figure": figure}
+    return {**parts, "notebook": notebook}
 
 
 def _gallery(workspace: Workspace, records: Sequence[RunRecord]) -> Figure | None:

@@ -90,8 +90,8 @@ def counted(verdicts: Sequence[Verdict]) -> str:
 
 
 def order_of(value: float) -> str:
-    """A small number as the power of ten above it, which is the same on all machines; "0" for 0."""
-    return "0" if value == 0 else f"below 1e{math.floor(math.log10(abs(value))) + 1}"
+    """An error as the power of ten above it, 1e-6 or more, so that rounding on another machine does not change it."""
+    return f"below 1e{math.floor(math.log10(max(abs(value), 1e-7))) + 1}"
 
 
 class Checks:

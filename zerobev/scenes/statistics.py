@@ -34,10 +34,10 @@ class HomeStatistics:
     def numbers(self) -> dict[str, float]:
         """All numbers as one table: description -> value."""
         table = {
-            "rooms a scene": self.rooms / self.scenes,
-            "objects a room, mean": self.objects_mean,
-            "objects a room, median": self.objects_median,
-            "walls a room": self.walls,
+            "rooms per scene": self.rooms / self.scenes,
+            "objects per room, mean": self.objects_mean,
+            "objects per room, median": self.objects_median,
+            "walls per room": self.walls,
         }
         table |= {f"rooms with {label}": fraction for label, fraction in self.fraction.items()}
         return table | {f"{label} in {kind}": mean for (kind, label), mean in self.mean.items()}

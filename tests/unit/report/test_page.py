@@ -3,6 +3,7 @@
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.workspace import Workspace
 from zerobev.report import page as summary
 from zerobev.report.claims import judge
+from zerobev.report.notebooks import NOTEBOOKS
 from zerobev.report.own_rows import OWN_CLAIMS, OWN_ROWS
 from zerobev.report.page import write_summary
 from zerobev.report.paper import CLAIMS, RATIOS, TABLES
@@ -74,7 +76,12 @@ def test_page_is_well_formed_and_links_only_to_its_own_files(report):
     tags = Tags()
     tags.feed(text)
     assert tags.open == []
-    assert tags.sources and all((folder / source).is_file() for source in tags.sources)
+    files = [source for source in tags.sources if not source.startswith("#")]
+    assert all((folder / source).is_file() for source in files)
+    assert {f"#{name}" for name in re.findall(r" id='([^']+)'", text)} == set(tags.sources) - set(files)
+    notebooks = {Path(source).name for source in files if source.endswith(".ipynb")}
+    assert notebooks == {path.name for path in NOTEBOOKS.glob("*.ipynb")}
+    assert {"figures/claims.png", *(f"tables/table{number}.csv" for number in (*TABLES, 6))} <= set(files)
     for verdict in (judge(claim, report[1]) for claim in CLAIMS):
         assert re.search(rf">{verdict.id}<.*?>{verdict.verdict}</td>", text)
     assert "not run" in text and "<td>35.0</td>" in text  # the mean of both seeds of (c)

@@ -205,7 +205,9 @@ def test_checks_show_the_numbers_of_verdicts():
     assert lines[1] == ["+3.0 points in the paper", "", "not run"]
 
 
-@pytest.mark.parametrize("value, text", [(0, "0"), (3e-7, "below 1e-6"), (-0.02, "below 1e-1"), (1e-6, "below 1e-5")])
+@pytest.mark.parametrize(
+    "value, text", [(0, "below 1e-6"), (3e-9, "below 1e-6"), (-0.02, "below 1e-1"), (2e-6, "below 1e-5")]
+)
 def test_order_of_a_small_number(value, text):
     assert order_of(value) == text
 

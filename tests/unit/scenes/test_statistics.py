@@ -41,13 +41,13 @@ def test_known_counts():
 
 def test_one_table_names_every_number():
     table = home_statistics(SCENES, KINDS).numbers
-    assert table["rooms a scene"] == 1.5
+    assert table["rooms per scene"] == 1.5
     assert table["rooms with chair"] == pytest.approx(2 / 3)
     assert table["plant in bedroom"] == 1.5
     assert set(HM3DSEM.numbers) - set(table) == {  # no such rooms here
         f"{label} in {kind}" for kind, label in HM3DSEM.mean if kind not in ("bedroom", "bathroom")
     }
-    assert HM3DSEM.numbers["rooms a scene"] == pytest.approx(14.36, abs=0.01)
+    assert HM3DSEM.numbers["rooms per scene"] == pytest.approx(14.36, abs=0.01)
 
 
 def test_instances_without_a_room_are_left_out():
