@@ -174,8 +174,11 @@ def shape_of_cells(label: np.ndarray) -> np.ndarray:
 def colour_of_cells(rgb: torch.Tensor, depth: torch.Tensor, camera: CameraConfig) -> np.ndarray:
     """Mean RGB colour of the pixels per cell, in 64 steps: (B, M, M) int64, -1 for a cell without pixels.
 
-    rgb: (B, 3, H, W) in [0, 1]; depth: (B, 1, H, W), metres. P^-1 gives the cell of each pixel.
+    rgb: (B, 3, H, W) floating point in [0, 1]; depth: (B, 1, H, W), metres. P^-1 gives the cell of each pixel.
+    Raises `InputError` for integers, such as the bytes of a batch before `data.samples.as_float`.
     """
+    if not rgb.is_floating_point():
+        raise InputError(f"rgb: expected floating point in [0, 1], found {rgb.dtype}")
     cells = camera.bev_px**2
     cell = cells_of_pixels(depth[:, 0], camera).flatten(1)
     index = (cell + torch.arange(len(cell))[:, None] * (cells + 1)).flatten().numpy()

@@ -276,3 +276,5 @@ def test_colour_of_a_cell_is_the_mean_of_its_pixels(rng):
                 assert value == 16 * red + 4 * green + blue
     white = colour_of_cells(torch.ones_like(rgb), depth, camera)
     assert set(np.unique(white)) == {-1, 63}
+    with pytest.raises(InputError, match=r"rgb: expected floating point in \[0, 1\], found torch.uint8"):
+        colour_of_cells((255 * rgb).to(torch.uint8), depth, camera)
