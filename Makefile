@@ -51,7 +51,7 @@ PARTS := $(MAKE) --jobs=2 --keep-going --output-sync=target
 test: setup ## run all tests, and check every notebook against its committed outputs
 	@$(PARTS) unit-2 integration nbval unit-1 integrity
 
-check: setup ## the fast loop, about 3 min: style, types, layers, and the unit tests that are not slow
+check: setup ## the fast loop, about 3 min: style, types, layers, spelling, and the unit tests that are not slow
 	@$(PARTS) fast-2 fast-1 static
 
 # The unit tests in two halves, which run at once; not for the list of `make help`.
@@ -72,7 +72,7 @@ fast-1 fast-2: setup
 integration: setup ## the tests of several rooms or processes
 	@$(PYTHON) -m pytest tests/integration
 
-static: setup ## style, types and layers
+static: setup ## style, types, layers and spelling
 	@$(PYTHON) -m pytest tests/integrity/test_static.py
 
 integrity: setup ## style, types, layers, records, dependencies, and the form of notebooks
