@@ -77,6 +77,8 @@ def has_clean_outputs(notebook: NotebookNode) -> None:
     assert outputs(notebook)
     assert not [output for output in outputs(notebook) if output.output_type == "error"]
     assert not [output for output in outputs(notebook) if output.get("name") == "stderr"]
+    texts = [output.get("data", {}).get("text/plain", "") for output in outputs(notebook)]
+    assert not [text for text in texts if re.search(r" at 0x[0-9a-f]+>", text)]  # an address, another one in each run
 
 
 def every_figure_is_shown(notebook: NotebookNode) -> None:
@@ -236,6 +238,7 @@ SPOILED = (
     (has_clean_outputs, lambda notebook: [cell.update(outputs=[]) for cell in code_cells(notebook)]),
     (has_clean_outputs, set_output(5, new_output("error", ename="ValueError", evalue="", traceback=[]))),
     (has_clean_outputs, set_output(5, new_output("stream", name="stderr", text="warning"))),
+    (has_clean_outputs, set_output(5, new_output("execute_result", {"text/plain": "<Legend at 0x7f1d067e6a50>"}))),
     (every_figure_is_shown, set_output(3)),
     (every_figure_is_shown, set_output(5, new_output("display_data", {"text/plain": "<Figure size 1x1>"}))),
     (has_the_parameters_of_the_command, set_source(1, 'SCALE = "smoke"\nSCENES = ""')),
