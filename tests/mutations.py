@@ -152,6 +152,28 @@ MUTATIONS = (
         "weight[:, : m.shape[1]]",
         ("tests/unit/models/test_networks.py",),
     ),
+    # an image once
+    Mutation(
+        "every photograph of a batch with the features of the first",
+        "zerobev/inference/image_view.py",
+        "tensor[n : n + 1] for tensor in features",
+        "tensor[:1] for tensor in features",
+        ("tests/unit/inference/test_image_view.py::test_a_batch_gives_the_maps_of_single_calls_in_one_pass",),
+    ),
+    Mutation(
+        "evidence without the empty image",
+        "zerobev/inference/image_view.py",
+        "(logits - empty).clamp(min=0)",
+        "logits.clamp(min=0)",
+        ("tests/unit/inference/test_projector.py::test_a_projector_gives_the_output_of_its_network",),
+    ),
+    Mutation(
+        "weights in the precision of the copy",
+        "zerobev/inference/placement.py",
+        "copy.deepcopy(module).to(device, dtype)",
+        "module.to(device, dtype)",
+        ("tests/unit/inference/test_image_view.py::test_precision_is_a_copy_s_and_changes_maps_by_rounding_alone",),
+    ),
     # the zero-shot stream
     Mutation(
         "zero-shot image one pixel to the right",

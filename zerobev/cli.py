@@ -14,6 +14,7 @@ from zerobev.common.errors import run_command
 #: Command -> module and line of help.
 COMMANDS = {
     "project": ("zerobev.inference.project", "masks, labels or boxes of your image, on a map"),
+    "export": ("zerobev.inference.export", "a network as an ONNX file, for programs without torch"),
     "evaluate": ("zerobev.evaluation.real_homes", "the shipped weights on a folder of homes"),
     "homes": ("zerobev.scenes.homes", "write generated homes"),
     "generate": ("zerobev.data.generate", "record scenes as shards of views"),
@@ -58,5 +59,5 @@ def _module(command: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] == "zerobev":
             raise
-        needed = "install zerobev[scenes,workbook]"
+        needed = f"install zerobev[{'export' if command == 'export' else 'scenes,workbook'}]"
         sys.exit(f"error: `zerobev {command}` needs the package {error.name}, which is not installed: {needed}")

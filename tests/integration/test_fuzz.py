@@ -29,7 +29,7 @@ import zerobev
 from zerobev.common.errors import InputError
 from zerobev.evaluation.metrics import Counts
 from zerobev.experiments.run_records import RunRecord, RunStore
-from zerobev.inference.projector import MAX_IMAGES
+from zerobev.inference.image_view import MAX_IMAGES
 from zerobev.scenes.hm3dsem import FIRST_LINE, read_instances, read_scene
 from zerobev.scenes.hm3dsem_writer import write_scene
 

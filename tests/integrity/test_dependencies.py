@@ -16,15 +16,24 @@ from support.paths import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DISTRIBUTIONS = packages_distributions()
-#: Each group includes the groups before it.
-GROUPS = ("core", "scenes", "workbook", "dev")
+#: Group -> the groups that it includes.
+INCLUDED = {
+    "core": (),
+    "export": ("core",),
+    "scenes": ("core",),
+    "workbook": ("core", "export", "scenes"),
+    "dev": ("core", "export", "scenes", "workbook"),
+}
+GROUPS = tuple(INCLUDED)
 #: Module or room of zerobev -> group; all others are core.
 GROUP_OF = {
+    "inference.export": "export",
     **dict.fromkeys(["common.parallel", "scenes", "rendering", "data", "evaluation"], "scenes"),
     **dict.fromkeys(["common.locks", "training", "experiments", "benchmarks", "report"], "workbook"),
 }
 #: Commands and plug-ins without an import.
 TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "codespell", "setuptools"}
+TOOLS |= {"onnx", "onnxscript"}  # torch imports them
 
 
 def requirements(group: str) -> dict[str, Requirement]:
@@ -37,7 +46,7 @@ def requirements(group: str) -> dict[str, Requirement]:
 
 def declared(group: str) -> set[str]:
     """Names of all distributions of an installation with a group."""
-    return {name for one in GROUPS[: GROUPS.index(group) + 1] for name in requirements(one)}
+    return {name for one in (*INCLUDED[group], group) for name in requirements(one)}
 
 
 def imported(source: str) -> set[str]:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from zerobev.benchmarks import data as generation
+from zerobev.benchmarks import projection
 from zerobev.benchmarks.throughput import measure_throughput
 from zerobev.benchmarks.training import (
     Machine,
@@ -177,6 +178,8 @@ def measure(setting: Scale, repeats: int) -> dict[str, Any]:
         "throughput": measure_throughput(setting, machine, repeats),
         "inference": inference,
         "calls": calls,
+        "views": projection.measure_views(machine, repeats),
+        "onnx": projection.measure_onnx(machine, repeats),
         "sizes": measure_sizes(setting, machine, repeats),
         "memory_mb": measure_memory(setting),
         "generation": generation.measure(setting, repeats, seconds=1.0),  # last: it leaves torch with one thread
@@ -211,6 +214,7 @@ def table(measured: dict[str, Any]) -> list[str]:
             )
     for k, found in measured["calls"].items():
         lines.append(f"{f'one call against {k} calls':<34}{found['ratio']:>9.2f} x")
+    lines += projection.table(measured["views"], measured["onnx"])
     lines += [f"{name:<34}{one['ratio']:>9.2f} x" for name, one in measured["sizes"].items()]
     return lines + [f"memory, {name:<26}{peak:>9.0f} MB" for name, peak in measured["memory_mb"].items()]
 

@@ -18,7 +18,8 @@ from zerobev.config import AgentConfig, CameraConfig
 from zerobev.geometry.projection import map_points
 from zerobev.inference.bev_map import BevArrows
 from zerobev.inference.flow import MIN_PX, Flow, flow_field
-from zerobev.inference.projector import GEOMETRIC, Projector, load
+from zerobev.inference.pretrained import GEOMETRIC
+from zerobev.inference.projector import Projector, load
 from zerobev.inference.shipped_weights import ROWS
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer

@@ -23,7 +23,8 @@ from zerobev.geometry.cameras import Camera, Pose
 from zerobev.geometry.projection import fov_mask
 from zerobev.inference.masks import Masks
 from zerobev.inference.pinhole import PinholeView
-from zerobev.inference.projector import GEOMETRIC, LEVEL, Projector, load
+from zerobev.inference.pretrained import GEOMETRIC
+from zerobev.inference.projector import LEVEL, Projector, load
 from zerobev.inference.shipped_weights import ROWS
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.rendering.photograph import Photographer

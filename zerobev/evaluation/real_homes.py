@@ -31,7 +31,8 @@ from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
 from zerobev.geometry.projection import inverse_project
-from zerobev.inference.projector import GEOMETRIC, Projector, load
+from zerobev.inference.pretrained import GEOMETRIC
+from zerobev.inference.projector import Projector, load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
 from zerobev.models.variants import VARIANTS
 from zerobev.scenes.readers import list_scenes, read_scene

@@ -19,7 +19,8 @@ from zerobev.data.views import View, ViewSource
 from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, iou_per_class
 from zerobev.geometry.projection import map_points
-from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.inference.pretrained import GEOMETRIC
+from zerobev.inference.projector import load
 from zerobev.inference.shipped_weights import ROWS
 from zerobev.scenes.readers import read_scene
 

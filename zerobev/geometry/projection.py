@@ -71,12 +71,19 @@ def inverse_project(
     height_m: (B,) heights of the cameras, see `cells_of_pixels`
     Returns (B, K, M, M).
     """
+    return pooled_in_cells(zero, cells_of_pixels(depth[:, 0], camera, height_m), camera.bev_px)
+
+
+def pooled_in_cells(zero: torch.Tensor, cells: torch.Tensor, side: int) -> torch.Tensor:
+    """Maximum of the values (B, K, H, W) over the pixels of each cell, (B, K, M, M) for `side` M; 0 without a pixel.
+
+    cells: (B, H, W) of `cells_of_pixels`
+    """
     batch, modalities = zero.shape[:2]
-    side = camera.bev_px
-    cells = cells_of_pixels(depth[:, 0], camera, height_m).view(batch, 1, -1).expand(batch, modalities, -1)
     pooled = zero.new_zeros(batch, modalities, side * side + 1)
-    pooled = pooled.scatter_reduce(2, cells, zero.flatten(2), reduce="amax")
-    return pooled[..., :-1].view(batch, modalities, side, side)
+    index = cells.flatten(1)[:, None].expand(batch, modalities, -1)
+    pooled = pooled.scatter_reduce(2, index, zero.flatten(2), reduce="amax")
+    return pooled[..., :-1].unflatten(2, (side, side))
 
 
 def inverse_project_mask(mask: np.ndarray, depth: np.ndarray, camera: CameraConfig) -> np.ndarray:

@@ -5,6 +5,7 @@ from zerobev.inference.bev_map import BevArrows, BevMap
 from zerobev.inference.boxes import Boxes
 from zerobev.inference.detector import HubDetector
 from zerobev.inference.flow import Flow
+from zerobev.inference.image_view import ImageView
 from zerobev.inference.labels import Labels
 from zerobev.inference.masks import Masks
 from zerobev.inference.modality import Modality
@@ -19,6 +20,7 @@ __all__ = [
     "Camera",
     "Flow",
     "HubDetector",
+    "ImageView",
     "Labels",
     "Masks",
     "Modality",

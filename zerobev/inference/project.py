@@ -20,7 +20,8 @@ from zerobev.inference.detector import HubDetector
 from zerobev.inference.labels import IGNORE, Labels
 from zerobev.inference.masks import Masks
 from zerobev.inference.modality import BinaryImages, Modality
-from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.inference.pretrained import shipped_names
+from zerobev.inference.projector import load
 from zerobev.inference.reader import read_image, read_labels
 from zerobev.inference.shipped_weights import ROWS
 
@@ -56,7 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pitch", type=float, default=0.0, help="degrees upwards; default 0, a level camera")
     parser.add_argument("--roll", type=float, default=0.0, help="degrees clockwise; default 0, a level camera")
     parser.add_argument("--depth", type=Path, metavar="FILE.npy", help="planar depth of a sensor, metres; 0: no value")
-    parser.add_argument("--row", default=ROWS[-1], help=f"one of {', '.join((GEOMETRIC, *ROWS))}, or a checkpoint")
+    names = ", ".join(shipped_names())
+    parser.add_argument("--row", default=ROWS[-1], help=f"one of {names}; or your checkpoint or folder")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="an NPZ is written beside it")
 
 

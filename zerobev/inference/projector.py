@@ -1,63 +1,112 @@
 """The trained networks, ready for use: `zerobev.load().project(rgb, modality)`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Self, overload
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
-from zerobev.data.sensor_depth import completed
 from zerobev.geometry.cameras import Camera
-from zerobev.geometry.projection import fov_mask, inverse_project
+from zerobev.geometry.projection import inverse_project
 from zerobev.inference.arrays import checked_image
 from zerobev.inference.bev_map import BevArrows, BevMap
-from zerobev.inference.flow import Flow
-from zerobev.inference.measured_depth import MAX_MEDIAN_M, checked_depth
-from zerobev.inference.modality import BinaryImages, Modality, Names
+from zerobev.inference.image_depth import image_depths
+from zerobev.inference.image_view import ImageView, image_views, kind_for, layers_of, project_layers
+from zerobev.inference.measured_depth import checked_depth
+from zerobev.inference.modality import Modality, Names, Result
 from zerobev.inference.pinhole import PinholeView
-from zerobev.inference.plain_arrays import kind_of
-from zerobev.inference.shipped_weights import DEPTH, ROWS, shipped
-from zerobev.models import TIM, VPN, BevModel, load_model
-from zerobev.models.decoder import resize
-from zerobev.models.depth import DepthEstimator, DepthNet
+from zerobev.inference.placement import placed, placement
+from zerobev.inference.pretrained import Parts, load_parts, save_parts
+from zerobev.inference.shipped_weights import ROWS
+from zerobev.models.base import ZeroShotModel
+from zerobev.models.depth import DepthEstimator
 
 #: The networks' camera: level, 0.88 m above the floor, 79 degrees.
 LEVEL = Camera()
-#: The row without a network: P^-1 with estimated depth.
-GEOMETRIC = "a.2"
-#: Maximum number of binary images per call; the features of all of them are in memory at the same time.
-MAX_IMAGES = 2048
 
 
 @dataclass(frozen=True, eq=False)
 class Projector:
-    """A network, or P^-1, with its camera and a depth estimator, on the CPU.
+    """A network, or P^-1, with its camera and a depth estimator.
 
-    Raises `InputError` for a network or estimator on another device.
+    It is never changed, so several threads may use it at the same time. Networks compute where and in the precision in
+    which their parameters are, see `to`; images and results are on the CPU.
     """
 
     row: str  #: of Tables 1 and 2, or the path of the checkpoint
     camera: CameraConfig
-    network: BevModel | None  #: None: P^-1 (row (a.2))
+    network: ZeroShotModel | None  #: None: P^-1 (row (a.2))
     estimator: DepthEstimator
 
-    def __post_init__(self) -> None:
-        for name, module in (("network", self.network), ("estimator", self.estimator)):
-            devices = {p.device.type for p in module.parameters()} if isinstance(module, nn.Module) else set()
-            if devices - {"cpu"}:
-                raise InputError(
-                    f"{name}: expected on the CPU, found on {min(devices - {'cpu'})}: move it by .to('cpu')"
-                )
+    @classmethod
+    def from_pretrained(cls, source: str | Path, estimator: DepthEstimator | None = None) -> Self:
+        """The projector in a folder of `save_pretrained`, in such a repository of the Hugging Face hub, or shipped.
+
+        source: a folder, a repository "OWNER/NAME", or a name as of `zerobev.load`
+        estimator: of depth, in place of the folder's
+        Raises `InputError` if there is none, and as `zerobev.load`.
+        """
+        return cls._of(load_parts(source, estimator, hub=True))
+
+    @classmethod
+    def _of(cls, parts: Parts) -> Self:
+        return cls(parts.row, parts.camera, parts.network, parts.estimator)
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write `config.json`, `model.safetensors` (of networks) and `depth.safetensors` for `from_pretrained`.
+
+        Raises `InputError` for a depth model of another library, which has files of its own, and for a folder that
+        cannot be written.
+        """
+        save_parts(Path(folder), Parts(Path(self.row).name, self.camera, self.network, self.estimator))
+
+    @property
+    def device(self) -> torch.device:
+        """Of the network; of the depth estimator for P^-1."""
+        return self._placement[0]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the network; of the depth estimator for P^-1."""
+        return self._placement[1]
+
+    @property
+    def _placement(self) -> tuple[torch.device, torch.dtype]:
+        return placement(self.estimator if self.network is None else self.network)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """A copy of this projector on another device or in another precision; None: unchanged.
+
+        dtype: torch.float32, torch.bfloat16 or torch.float16, of network and depth estimator. Depth, logits and results
+            are float32 in any case.
+        A depth estimator that is no torch module stays as it is: its input is then on the CPU, in float32.
+        Raises `InputError` for another type, and for a device that torch cannot use here.
+        """
+        network, estimator = placed(self.network, device, dtype), placed(self.estimator, device, dtype)
+        return replace(self, network=network, estimator=estimator)
+
+    def view(self, rgb: Any, camera: Camera = LEVEL, depth: Any = None) -> ImageView:
+        """A photograph with all that depends on it alone: features, depth, field of view. Arguments as of `project`.
+
+        `view.project(modality)` then costs a fraction of `project(rgb, modality)`, with the same result.
+        """
+        return self._views([rgb], camera, [depth])[0]
+
+    def _views(self, images: Sequence[Any], camera: Camera, depths: Sequence[Any]) -> list[ImageView]:
+        photographs = [checked_image(image) for image in images]
+        measured = [_measured(depth, photograph) for depth, photograph in zip(depths, photographs)]
+        return image_views(self, photographs, camera, measured)
 
     @overload
     def project(
-        self, rgb: Any, modality: Flow, camera: Camera = ..., depth: None = ..., names: None = ...
-    ) -> BevArrows: ...
+        self, rgb: Any, modality: Modality[Result], camera: Camera = ..., depth: Any = ..., names: Names = ...
+    ) -> Result: ...
 
     @overload
     def project(
@@ -81,26 +130,46 @@ class Projector:
         camera: of the photograph; the map is that of the level camera at its place and heading
         depth: (H, W) floating point, planar depth of each pixel from a sensor, metres; 0 or NaN for no value. Estimated
             depth, scaled to the sensor's, replaces missing values. Used by P^-1, by residual networks, and for the
-            field of view; not possible for `Flow`, which has two photographs
+            field of view; not possible for `Flow` with two photographs
         names: of the masks, labels or images of an array; default: the numbers
 
         The network's camera is level, 0.88 m above the floor, with a field of view of 79 degrees. Photographs are
         resampled to this view, see `zerobev.inference.pinhole`: parts outside of it are cropped. Parts of the view
         without photograph get the colours at its border, have empty masks, and are outside the map's field of view.
-        Maps of empty masks are empty.
+        Maps of empty masks are empty. For several modalities of one photograph see `view`.
 
         Returns a `BevArrows` for `Flow`, else a `BevMap`. Raises `InputError` for wrong shapes, types or ranges, NaN,
         empty input, ambiguous arrays, and more than `MAX_IMAGES` binary images (eight per image of real values).
         """
-        photograph = checked_image(rgb)
-        shape = photograph.shape[:2]
-        kind = _kind(modality, shape, names)
-        layers = kind.layers(shape)
-        if depth is not None and any(layer.photograph is not None for layer in layers):
-            raise InputError(f"depth: expected none for {type(kind).__name__}, found depth of one of two photographs")
-        measured = None if depth is None else checked_depth(depth, shape)
-        frames = (photograph if layer.photograph is None else layer.photograph for layer in layers)
-        return kind.result(tuple(self._maps(frame, layer, camera, measured) for frame, layer in zip(frames, layers)))
+        return self.view(rgb, camera, depth).project(modality, names)
+
+    @overload
+    def project_batch(
+        self, images: Sequence[Any], modalities: Sequence[Modality[Result]], camera: Camera = ...
+    ) -> list[Result]: ...
+
+    @overload
+    def project_batch(
+        self, images: Sequence[Any], modalities: Sequence[Any], camera: Camera = ...
+    ) -> list[BevMap | BevArrows]: ...
+
+    def project_batch(self, images: Sequence[Any], modalities: Sequence[Any], camera: Camera = LEVEL) -> list[Any]:
+        """As `project`, of one modality per photograph, in one call of the network; for GPUs.
+
+        All photographs are of one camera; sizes may differ. Results are in the order of `images`. Modalities should
+        have about the same number of binary images: each photograph costs as much as the one with most.
+        """
+        if len(images) != len(modalities) or not len(images):
+            found = f"{len(modalities)} for {len(images)} images"
+            raise InputError(f"modalities: expected one per image, and an image at least, found {found}")
+        photographs = [checked_image(image) for image in images]
+        kinds = [kind_for(modality, one.shape[:2], None) for modality, one in zip(modalities, photographs)]
+        layers = [layers_of(kind, one.shape[:2], False) for kind, one in zip(kinds, photographs)]
+        flat = [(one, layer) for one, layers_of_one in zip(photographs, layers) for layer in layers_of_one]
+        frames = [one if layer.photograph is None else layer.photograph for one, layer in flat]
+        views = image_views(self, frames, camera, [None] * len(frames))
+        maps = iter(project_layers(list(zip(views, (layer for _, layer in flat)))))
+        return [kind.result(tuple(islice(maps, len(layer)))) for kind, layer in zip(kinds, layers)]
 
     def depth(self, rgb: Any, camera: Camera = LEVEL, depth: Any = None) -> np.ndarray:
         """Planar depth in the network's camera, (S, S) float32, metres; 0 outside the photograph.
@@ -108,117 +177,32 @@ class Projector:
         depth: of a sensor, see `project`; without it, all depth is estimated
         """
         photograph = checked_image(rgb)
-        measured = None if depth is None else checked_depth(depth, photograph.shape[:2])
-        view = PinholeView(photograph.shape[:2], camera, self.camera)
+        view, measured = PinholeView(photograph.shape[:2], camera, self.camera), _measured(depth, photograph)
         with torch.inference_mode():
-            return self._depth(photograph, camera, view, measured)[0, 0].numpy()
-
-    def _depth(self, photograph: np.ndarray, source: Camera, view: PinholeView, measured: np.ndarray | None) -> Tensor:
-        """(1, 1, S, S) metres: measured, and estimated where no value was measured."""
-        covered = torch.from_numpy(view.covered)
-        if measured is None:
-            return self._estimated(photograph, source, view) * covered
-        known = view.depth(measured)
-        if not (known > 0)[view.covered].all():
-            known = completed(known, self._estimated(photograph, source, view)[0, 0].numpy())
-        return torch.from_numpy(known)[None, None] * covered
-
-    def _estimated(self, photograph: np.ndarray, source: Camera, view: PinholeView) -> Tensor:
-        """(1, 1, S, S) metres; the estimator's input has its `side_px`, if it has one."""
-        side = self.camera.fpv_px
-        # at most the resolution of the photograph, which the estimator enlarges smoothly
-        input_px = min(getattr(self.estimator, "side_px", side), view.resolution_px)
-        if input_px > side:
-            fine_view = PinholeView(photograph.shape[:2], source, replace(self.camera, fpv_px=input_px))
-        else:
-            fine_view = view
-        depth = _checked_estimate(self.estimator(_batch(fine_view.photograph(photograph))), fine_view.covered.shape)
-        return resize(depth, (side, side))
-
-    @torch.inference_mode()
-    def _maps(
-        self, photograph: np.ndarray, images: BinaryImages, source: Camera, measured: np.ndarray | None
-    ) -> BevMap:
-        view = PinholeView(photograph.shape[:2], source, self.camera)
-        if (count := len(images.labels) * images.levels) > MAX_IMAGES:
-            raise InputError(f"modality: expected {MAX_IMAGES} binary images at most, found {count}")
-        zero = torch.from_numpy(np.stack([view.mask(image) for image in images.images])).float()
-        rgb = _batch(view.photograph(photograph))
-        depth = self._depth(photograph, source, view, measured)
-        maps = torch.zeros(2, len(zero), self.camera.bev_px, self.camera.bev_px)  # values and evidence
-        filled = zero.flatten(1).any(dim=1)
-        if filled.any():
-            maps[:, filled] = torch.stack(self._values_and_evidence(rgb, zero[filled], depth, source.height_m))
-        values, evidence = maps.unflatten(1, (-1, images.levels)).mean(dim=2).numpy()
-        fov = fov_mask(depth[0, 0].numpy(), self.camera.at_height(source.height_m))
-        return BevMap(values, images.labels, evidence, fov, self.camera, images.scores)
-
-    def _values_and_evidence(self, rgb: Tensor, zero: Tensor, depth: Tensor, height_m: float) -> tuple[Tensor, Tensor]:
-        """Images (K, S, S) of one photograph -> (K, M, M) `BevMap.values` and `BevMap.evidence`."""
-        heights = torch.tensor([height_m])
-        if self.network is None:
-            values = inverse_project(zero[None], depth, self.camera, heights)[0]
-            return values, values
-        with_empty = torch.cat([zero, torch.zeros_like(zero[:1])])[None]
-        logits = self.network(rgb, with_empty, depth, heights).zero_logits[0]
-        return logits[:-1].sigmoid(), (logits[:-1] - logits[-1]).clamp(min=0)
+            return image_depths(self.estimator, [photograph], [view], [measured], camera, self.camera)[0]
 
     def predict(self, batch: Mapping[str, Tensor]) -> Tensor:
         """A batch of `data.samples` -> maps (B, K, M, M) bool, for `evaluation.evaluate`; with estimated depth."""
-        depth, heights = self.estimator(batch["rgb"]), batch.get("height")
+        rgb, zero = (batch[name].to(self.device, self.dtype) for name in ("rgb", "zero"))
+        heights = batch["height"].to(self.device) if "height" in batch else None
+        depth = self.estimator(batch["rgb"].to(*placement(self.estimator))).float().to(self.device)
         if self.network is None:
-            return inverse_project(batch["zero"], depth, self.camera, heights) > 0.5
-        return self.network(batch["rgb"], batch["zero"], depth, heights).zero_logits > 0
+            return inverse_project(zero, depth, self.camera, heights) > 0.5
+        return self.network(rgb, zero, depth, heights).zero_logits > 0
 
 
 def load(source: str | Path = ROWS[-1], estimator: DepthEstimator | None = None) -> Projector:
-    """A projector with shipped weights, or from your checkpoint.
+    """A projector with shipped weights, or with your own.
 
-    source: a shipped row (`shipped_weights.ROWS`), "a.2" for the projection P^-1, or the path of a checkpoint
-    estimator: of metric depth, for the field of view, P^-1 and residual networks; default: the shipped one
-    Raises `InputError` for an unknown row, for a file other than a zero-shot network, and if the shipped depth
-    estimator does not fit the network's camera.
+    source: a shipped row (`shipped_weights.ROWS`), "a.2" for the projection P^-1, one of their names
+        (`pretrained.NAMES`), the path of a checkpoint, or a folder of `Projector.save_pretrained`
+    estimator: of metric depth, for the field of view, P^-1 and residual networks; default: the shipped one, or that of
+        the folder
+    Raises `InputError` for an unknown row, for a file other than a zero-shot network, and if the depth estimator does
+    not fit the network's camera.
     """
-    depth = DepthNet.load(shipped(DEPTH)) if estimator is None else estimator
-    if source == GEOMETRIC:
-        return Projector(GEOMETRIC, DepthNet.load(shipped(DEPTH)).camera, None, depth)
-    network = load_model(shipped(str(source)) if source in ROWS else _existing(source))
-    if isinstance(network, VPN | TIM | DepthNet):
-        raise InputError(f"{source}: expected a zero-shot network, found {type(network).__name__}")
-    if isinstance(depth, DepthNet) and depth.camera.fpv_px != network.camera.fpv_px:
-        sides = f"{network.camera.fpv_px} px, found one for {depth.camera.fpv_px} px"
-        raise InputError(f"estimator: expected a depth estimator for images of {sides}")
-    return Projector(str(source), network.camera, network, depth)
+    return Projector._of(load_parts(source, estimator))
 
 
-def _kind(modality: Any, shape: tuple[int, int], names: Names) -> Modality[Any]:
-    if not isinstance(modality, Modality):
-        return kind_of(modality, shape, names)
-    if names is None:
-        return modality
-    if getattr(modality, "names", ()) is not None:
-        raise InputError(f"names: expected none for {type(modality).__name__}, which contains its names")
-    return replace(modality, names=names)  # type: ignore[type-var]  # a dataclass with a field of this name
-
-
-def _checked_estimate(depth: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Output of an estimator, (1, 1, S, S). Raises `InputError` if it cannot be metres."""
-    expected = (1, 1, *shape)
-    if tuple(depth.shape) != expected:
-        raise InputError(f"estimator: expected depth {expected}, found {tuple(depth.shape)}")
-    if not (torch.isfinite(depth).all() and (depth >= 0).all()):
-        raise InputError("estimator: expected finite depth from 0 up, found NaN, infinity or less")
-    if (median := float(depth.median())) > MAX_MEDIAN_M:
-        raise InputError(f"estimator: expected depth in metres, found a median of {median:g}: millimetres?")
-    return depth
-
-
-def _batch(photograph: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(photograph, -1, 0)))[None]
-
-
-def _existing(source: str | Path) -> Path:
-    if not Path(source).is_file():
-        rows = ", ".join((GEOMETRIC, *ROWS))
-        raise InputError(f"source: expected one of {rows} or the path of a checkpoint, found {str(source)!r}")
-    return Path(source)
+def _measured(depth: Any, photograph: np.ndarray) -> np.ndarray | None:
+    return None if depth is None else checked_depth(depth, photograph.shape[:2])

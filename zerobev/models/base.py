@@ -4,10 +4,12 @@ A checkpoint holds the class of a network, its camera, its `ModelConfig` and its
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -15,10 +17,14 @@ from torch import Tensor, nn
 from zerobev.common.errors import InputError
 from zerobev.common.storage import replacing
 from zerobev.config import AUX, CameraConfig, ModelConfig
+from zerobev.geometry.projection import cells_of_pixels, pooled_in_cells
 from zerobev.models.backbone import RgbEncoder
 
 #: Maximum number of zero-shot images per forward pass; larger batches still pass whole.
 IMAGES_PER_PASS = 16
+
+#: Features of B images: tensors whose first axis is B. Their meaning belongs to the network's class.
+Features = tuple[Tensor, ...]
 
 
 class MapLogits(NamedTuple):
@@ -47,12 +53,13 @@ class BevModel(nn.Module):
             raise InputError(f"aux: expected maps among {AUX}, in this order, found {model.aux}")
         self.camera, self.config = camera, model
 
-    def check(self, **images: tuple[Tensor | None, int | None]) -> int:
+    def check(self, batch: int = 0, **images: tuple[Tensor | None, int | None]) -> int:
         """Check images against the camera's size and their numbers of channels (None: any); returns the batch size.
 
+        batch: expected size; 0: that of the first image
         Raises `InputError` for the first image of another shape.
         """
-        side, batch = self.camera.fpv_px, 0  # 0: unknown
+        side = self.camera.fpv_px
         for name, (image, channels) in images.items():
             found = None if image is None else tuple(image.shape)
             if found is not None and len(found) == 4:
@@ -63,11 +70,6 @@ class BevModel(nn.Module):
                 expected = f"({batch or 'B'}, {channels or 'K'}, {side}, {side})"
                 raise InputError(f"{name}: expected {expected}, found {found}")
         return batch
-
-    def check_inputs(self, rgb: Tensor, zero: Tensor, depth: Tensor | None) -> None:
-        """`check` for the inputs of a zero-shot network; depth is checked only in residual variants."""
-        read = {"depth": (depth, 1)} if self.config.residual else {}
-        self.check(rgb=(rgb, 3), zero=(zero, None), **read)
 
     def save(self, path: Path) -> None:
         """Write one safetensors file: the weights, with class and configuration as JSON in its metadata."""
@@ -99,6 +101,72 @@ class BevModel(nn.Module):
             found = " ".join(str(error).split())
             raise InputError(f"{path}: expected the weights of its configuration, found: {found}") from error
         return network.eval()
+
+
+class ZeroShotModel(BevModel):
+    """A network that projects any zero-shot image: `decode(encode(rgb, depth), zero)`.
+
+    `encode` computes all that does not depend on the zero-shot images. Its result serves any number of calls of
+    `decode`, for B images at once; `features[b : b + 1]` of each tensor are those of one image.
+    """
+
+    def forward(
+        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
+    ) -> MapLogits:
+        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
+
+        depth: (B, 1, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
+        height_m: (B,) of the cameras, for the limit on heights of P^-1; default: `camera.height_m`
+        """
+        self.check(rgb=(rgb, 3), zero=(zero, None))
+        return self.decode(self.encode(rgb, depth, height_m), zero)
+
+    def encode(self, rgb: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None) -> Features:
+        """All features of B RGB images, for `decode`; arguments as of the call.
+
+        Raises `InputError` for images of another shape or type, and in the residual variant for missing depth.
+        """
+        batch = self.check(rgb=(rgb, 3))
+        if not self.config.residual:
+            return self.image_features(rgb)
+        self.check(batch, depth=(depth, 1))
+        assert depth is not None  # as checked
+        cells = cells_of_pixels(depth[:, 0], self.camera, height_m)
+        if not self.config.seen:
+            return cells, *self.image_features(rgb)
+        everything = pooled_in_cells(torch.ones_like(rgb[:, :1]), cells, self.camera.bev_px)
+        return cells, everything, *self.image_features(rgb)
+
+    def decode(self, features: Features, zero: Tensor) -> MapLogits:
+        """Zero-shot images (B, K, H, W) of the images of `encode` -> `MapLogits`.
+
+        Raises `InputError` for images of another shape or type.
+        """
+        self.check(features[0].shape[0], zero=(zero, None))
+        if not self.config.residual:
+            return self.project_images(features, zero, None)
+        of_depth = 1 + self.config.seen
+        (cells, *everything), rest = features[:of_depth], features[of_depth:]
+        projected = pooled_in_cells(zero, cells, self.camera.bev_px)
+        maps = [projected, *(one.expand_as(projected) for one in everything)]
+        return self.project_images(rest, zero, torch.stack(maps, dim=2))
+
+    def image_features(self, rgb: Tensor) -> Features:
+        """The features of the RGB images, of at least one tensor, apart from those of depth."""
+        raise NotImplementedError
+
+    def project_images(self, features: Features, zero: Tensor, projected: Tensor | None) -> MapLogits:
+        """As `decode`, from `image_features`.
+
+        projected: (B, K, 1 or 2, M, M), P^-1 of the zero-shot images, and of the whole view with `ModelConfig.seen`;
+            None: not the residual variant
+        """
+        raise NotImplementedError
+
+
+def in_passes(images: Tensor, size: int, dim: int = 0) -> Sequence[Tensor]:
+    """Parts of at most `size` images along an axis; of an exported graph one part, whatever the number of images."""
+    return (images,) if torch.compiler.is_exporting() else images.split(size, dim)
 
 
 def description(path: Path) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class DepthNet(BevModel):
         maps = self.backbone(rgb)
         merged: Tensor | None = None
         for features, lateral, merge in reversed(list(zip(maps, self.laterals, self.merges))):
-            rays = F.adaptive_avg_pool2d(self.rays, features.shape[-2:]).expand(len(rgb), -1, -1, -1)
+            rays = F.adaptive_avg_pool2d(self.rays, features.shape[-2:]).expand(rgb.shape[0], -1, -1, -1)
             fine = lateral(torch.cat([features, rays.to(features.dtype)], dim=1))
             merged = merge(fine if merged is None else fine + resize(merged, fine.shape[-2:]))
         pixels = F.pixel_shuffle(self.head(merged), self.config.stem_stride)[..., : rgb.shape[-2], : rgb.shape[-1]]

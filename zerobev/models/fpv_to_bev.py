@@ -54,7 +54,7 @@ class FpvToBev(nn.Module):
         fastest.
         """
         rays, attention = zip(*(band(columns(m)) for band, m in zip(self.bands, reversed(maps))))
-        return self.to_map([r.unflatten(0, (len(maps[0]), -1)) for r in rays]), list(attention)
+        return self.to_map([r.unflatten(0, (maps[0].shape[0], -1)) for r in rays]), list(attention)
 
     def to_map(self, rays: Sequence[Tensor]) -> Tensor:
         """Rays (N, C_b, P_b, d) of each band, near band first -> features (N, d, M, M)."""
@@ -72,7 +72,7 @@ def reweigh(cross: Tensor, values: Tensor) -> Tensor:
     Returns rays (B * K, C, P, d).
     """
     cross = cross.unflatten(0, (-1, values.shape[-1]))  # B C heads P R
-    values = values.unflatten(1, (cross.shape[2], -1)).unflatten(0, (len(cross), -1))  # B K heads e R C
+    values = values.unflatten(1, (cross.shape[2], -1)).unflatten(0, (cross.shape[0], -1))  # B K heads e R C
     return torch.einsum("bchpr,bkherc->bkcphe", cross, values).flatten(-2).flatten(0, 1)
 
 

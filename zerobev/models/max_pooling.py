@@ -14,9 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
-from zerobev.geometry.projection import inverse_project
 from zerobev.models.backbone import RgbEncoder
-from zerobev.models.base import IMAGES_PER_PASS, BevModel, MapLogits
+from zerobev.models.base import IMAGES_PER_PASS, Features, MapLogits, ZeroShotModel, in_passes
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.polar import PolarToCartesian, floor_row
 from zerobev.models.pyramid import FeaturePyramid
@@ -27,24 +26,21 @@ _FLOOR_WIDTH = 1 / 32
 _MIN_LOGIT = -4.0
 
 
-def noisy_or(logits: Tensor, values: Tensor) -> Tensor:
-    """1 - prod_y (1 - g_y h_y) for gates g = sigmoid(logits) and values h in [0, 1], per modality.
+def noisy_or(closed: Tensor, values: Tensor) -> Tensor:
+    """1 - prod_y (1 - g_y)^h_y for gates g and values h in [0, 1], per modality.
 
-    For binary gates and values this is the maximum over the pixels with an open gate. In general it lies between the
-    maximum of g_y h_y and their sum, and is monotone in every value.
+    For binary values this is 1 - prod_y (1 - g_y h_y), between the maximum of g_y h_y and their sum; for binary gates,
+    too, the maximum over the pixels with an open gate. It is monotone in every value. A value between 0 and 1 is that
+    fraction of a white pixel.
 
-    logits: (..., P, R) of P positions over R pixels
+    closed: (..., P, R), -log(1 - g) of P positions over R pixels, `softplus` of the gates' logits
     values: (..., R, K) of K modalities
-    Returns (..., P, K) in [0, 1].
+    Returns (..., P, K) float32 in [0, 1].
     """
-    if bool(((values == 0) | (values == 1)).all()):
-        # log (1 - g h) = h log (1 - g): one matrix product for all modalities
-        with torch.autocast(logits.device.type, enabled=False):
-            closed = -(F.softplus(logits) @ values.to(logits.dtype))
-    else:
-        gates = logits.sigmoid().float().clamp(max=1 - 1e-6)
-        closed = torch.stack([torch.log1p(-gates * h[..., None, :]).sum(-1) for h in values.unbind(-1)], dim=-1)
-    return -torch.expm1(closed.float())
+    # the logarithm is one matrix product for all modalities
+    with torch.autocast(closed.device.type, enabled=False):
+        logarithm = -(closed @ values.to(closed.dtype))
+    return -torch.expm1(logarithm.float())
 
 
 class Gates(nn.Module):
@@ -70,7 +66,7 @@ class Gates(nn.Module):
         return fine + self.prior.to(fine.dtype)
 
 
-class MaxPoolZeroBEV(BevModel):
+class MaxPoolZeroBEV(ZeroShotModel):
     """Geometry from the RGB image alone; zero-shot values are pooled to the map before any network processes them.
 
     Every pixel of the zero-shot image has its own gates, so the pooled map has the resolution of the image. The U-Net
@@ -92,29 +88,24 @@ class MaxPoolZeroBEV(BevModel):
             self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(
-        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
-    ) -> MapLogits:
-        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
-
-        depth: (B, 1, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
-        height_m: (B,) of the cameras, for the limit on heights of P^-1; default: `camera.height_m`
-        """
-        self.check_inputs(rgb, zero, depth)
+    def image_features(self, rgb: Tensor) -> Features:
+        """Gates (B, W, P, H), as for `noisy_or`, and features on the map (B, width, M, M)."""
         (features,) = self.pyramid(self.backbone(rgb))
         gates = self.gates(features)
-        pooled = noisy_or(gates, zero.permute(0, 3, 2, 1))  # B W P K
+        with torch.autocast(gates.device.type, enabled=False):
+            closed = F.softplus(gates)
+        return closed, self.map_features(features, gates)
+
+    def project_images(self, features: Features, zero: Tensor, projected: Tensor | None) -> MapLogits:
+        """As `ZeroShotModel.project_images`."""
+        closed, map_features = features
+        pooled = noisy_or(closed, zero.permute(0, 3, 2, 1))  # B W P K
         pooled = self.resample_pixels(pooled)[0].permute(0, 3, 1, 2)  # B K M M
-        maps = [pooled]
-        if self.config.residual:
-            assert depth is not None  # as checked
-            maps.append(inverse_project(zero, depth, self.camera, height_m))
-            if self.config.seen:
-                everything = inverse_project(torch.ones_like(zero[:, :1]), depth, self.camera, height_m)
-                maps.append(everything.expand_as(maps[-1]))
-        embedded = self.embedding(torch.stack(maps, dim=2).flatten(0, 1)).unflatten(0, zero.shape[:2])
-        inputs = (self.map_features(features, gates)[:, None] + embedded).flatten(0, 1)
-        logits = torch.cat([self.decoder(part) for part in inputs.split(max(len(zero), IMAGES_PER_PASS))])
+        maps = pooled[:, :, None] if projected is None else torch.cat([pooled[:, :, None], projected], dim=2)
+        embedded = self.embedding(maps.flatten(0, 1).to(zero.dtype)).unflatten(0, zero.shape[:2])
+        inputs = (map_features[:, None] + embedded).flatten(0, 1)
+        parts = in_passes(inputs, max(zero.shape[0], IMAGES_PER_PASS))
+        logits = torch.cat([self.decoder(part) for part in parts])
         logits = logits.unflatten(0, zero.shape[:2])
         return MapLogits(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None, pooled)
 

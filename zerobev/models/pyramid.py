@@ -29,10 +29,10 @@ class FeaturePyramid(nn.Module):
         if first is None:
             merged = [lateral(features) for lateral, features in zip(self.laterals, maps)]
         else:
-            merged = [
-                (F.conv2d(m, weight[:, -m.shape[1] :]).unflatten(0, (len(shared), -1)) + shared[:, None]).flatten(0, 1)
-                for m, weight, shared in zip(maps, self._parameter("weight"), first)
-            ]
+            merged = []
+            for m, weight, shared in zip(maps, self._parameter("weight"), first):
+                own = F.conv2d(m, weight[:, -m.shape[1] :]).unflatten(0, (shared.shape[0], -1))
+                merged.append((own + shared[:, None]).flatten(0, 1))
         for fine in range(len(merged) - 2, -1, -1):
             rows, columns = merged[fine].shape[-2:]
             # doubled and cropped, not stretched: coarse pixel i matches fine pixels 2i and 2i + 1 at odd sizes, too

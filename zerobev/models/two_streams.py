@@ -12,13 +12,13 @@ from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.base import IMAGES_PER_PASS, BevModel, MapLogits
+from zerobev.models.base import IMAGES_PER_PASS, Features, MapLogits, ZeroShotModel, in_passes
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev, reweigh
 from zerobev.models.pyramid import FeaturePyramid
 
 
-class TwoStreamZeroBEV(BevModel):
+class TwoStreamZeroBEV(ZeroShotModel):
     """Two streams with one attention (paper, Fig. 2e): geometry comes from the RGB image alone.
 
     The RGB stream is a transformer. The zero-shot stream uses the attention weights of the RGB stream's last
@@ -40,21 +40,21 @@ class TwoStreamZeroBEV(BevModel):
         self.outs = nn.ModuleList(nn.Linear(c, model.width) for c in reversed(model.zero_channels))  # near band first
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(
-        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
-    ) -> MapLogits:
-        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W), both float32 -> `MapLogits`.
-
-        Depth and heights are not used.
-        """
-        batch = self.check(rgb=(rgb, 3), zero=(zero, None))
+    def image_features(self, rgb: Tensor) -> Features:
+        """Features on the map (B, width, M, M); then per band, near first, attention (B, C, heads, P, R)."""
         rgb_features, attention = self.bands(self.pyramid(self.backbone(rgb)))
+        return rgb_features, *(band.cross[-1].unflatten(0, (rgb.shape[0], -1)) for band in attention)
+
+    def project_images(self, features: Features, zero: Tensor, projected: Tensor | None) -> MapLogits:
+        """As `ZeroShotModel.project_images`, without P^-1."""
+        rgb_features, *attention = features
+        batch = rgb_features.shape[0]
         zero_maps = self.zero_cnn(zero.flatten(0, 1)[:, None])[::-1]  # near band first
-        zero_rays = [out(reweigh(band.cross[-1], m)) for out, band, m in zip(self.outs, attention, zero_maps)]
+        zero_rays = [out(reweigh(cross.flatten(0, 1), m)) for out, cross, m in zip(self.outs, attention, zero_maps)]
         zero_features = self.bands.to_map(zero_rays)
         # in training both streams are one batch: one set of batch statistics, as in evaluation
-        features = torch.cat([rgb_features, zero_features]).split(max(2 * batch, IMAGES_PER_PASS))
-        logits = torch.cat([self.decoder(part) for part in features])
+        both = in_passes(torch.cat([rgb_features, zero_features]), max(2 * batch, IMAGES_PER_PASS))
+        logits = torch.cat([self.decoder(part) for part in both])
         return MapLogits(logits[batch:, 0].unflatten(0, zero.shape[:2]), logits[:batch, 1:])
 
     def attention(self, rgb: Tensor, zero: Tensor | None = None) -> list[BandAttention]:

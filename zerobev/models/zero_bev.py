@@ -12,16 +12,15 @@ import torch
 from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
-from zerobev.geometry.projection import inverse_project
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.base import IMAGES_PER_PASS, BevModel, MapLogits
+from zerobev.models.base import IMAGES_PER_PASS, Features, MapLogits, ZeroShotModel, in_passes
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev
 from zerobev.models.pyramid import FeaturePyramid
 
 
-class ZeroBEV(BevModel):
+class ZeroBEV(ZeroShotModel):
     """Zero-BEV (paper, Fig. 2c; with `residual` 2d): project any zero-shot image to the map, given the RGB image.
 
     Eq. 5 concatenates the two images; as in the supplement, the two feature maps of each stride are concatenated here.
@@ -42,32 +41,21 @@ class ZeroBEV(BevModel):
                 self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
-    def forward(
-        self, rgb: Tensor, zero: Tensor, depth: Tensor | None = None, height_m: Tensor | None = None
-    ) -> MapLogits:
-        """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
+    def image_features(self, rgb: Tensor) -> Features:
+        """The RGB part of the pyramid's laterals, see `rgb_laterals`."""
+        return tuple(self.rgb_laterals(rgb))
 
-        depth: (B, 1, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
-        height_m: (B,) of the cameras, for the limit on heights of P^-1; default: `camera.height_m`
-        """
-        self.check_inputs(rgb, zero, depth)
-        images = [zero]
-        if self.config.residual:
-            assert depth is not None  # as checked
-            projected = inverse_project(zero, depth, self.camera, height_m)[:, :, None]
-            if self.config.seen:
-                everything = inverse_project(torch.ones_like(zero[:, :1]), depth, self.camera, height_m)
-                projected = torch.cat([projected, everything[:, :, None].expand_as(projected)], dim=2)
-            images.append(projected)
-        laterals = self.rgb_laterals(rgb)
-        parts = zip(*(image.split(max(1, IMAGES_PER_PASS // len(zero)), dim=1) for image in images))
-        logits = torch.cat([self.pass_images(laterals, *part) for part in parts], dim=1)  # B K 1+aux M M
+    def project_images(self, features: Features, zero: Tensor, projected: Tensor | None) -> MapLogits:
+        """As `ZeroShotModel.project_images`, in passes of few images."""
+        images = [zero] if projected is None else [zero, projected]
+        parts = zip(*(in_passes(image, max(1, IMAGES_PER_PASS // zero.shape[0]), dim=1) for image in images))
+        logits = torch.cat([self.pass_images(features, *part) for part in parts], dim=1)  # B K 1+aux M M
         return MapLogits(logits[:, :, 0], logits[:, :, 1:].mean(1) if self.config.aux else None)
 
     def pass_images(self, laterals: Sequence[Tensor], zero: Tensor, projected: Tensor | None = None) -> Tensor:
         """`rgb_laterals` of B images, zero-shot images (B, K, H, W) -> logits (B, K, 1 + len(aux), M, M).
 
-        projected: (B, K, 1 or 2, M, M), P^-1 of the zero-shot images, and of the whole view, in the residual variant
+        projected: as of `project_images`
         """
         features, _ = self.bands(self.fpv_maps(laterals, zero))
         if projected is not None:

@@ -11,7 +11,8 @@ from zerobev.evaluation import other_cameras
 from zerobev.evaluation.other_cameras import CameraStudio, ScaledCells
 from zerobev.geometry.cameras import Camera
 from zerobev.inference.masks import Masks
-from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.inference.pretrained import GEOMETRIC
+from zerobev.inference.projector import load
 from zerobev.scenes.hm3dsem_writer import write_scene
 
 from support.scenes import build, furnished

@@ -313,11 +313,6 @@ def test_depth_that_is_not_in_metres_is_refused(estimate, message, rgb):
         zerobev.Projector("a.2", CAMERA, None, estimate).project(rgb, np.ones((SIDE, SIDE), bool))
 
 
-def test_a_network_on_another_device_is_refused():
-    with pytest.raises(InputError, match=r"estimator: expected on the CPU, found on meta: move it by .to\('cpu'\)"):
-        zerobev.Projector("a.2", CAMERA, None, torch.nn.Linear(1, 1, device="meta"))
-
-
 def test_depth_is_zero_outside_the_photograph(models, rgb):
     depth = models["a.2"].depth(rgb, zerobev.Camera(40))
     assert depth.shape == (SIDE, SIDE) and depth[SIDE // 2, SIDE // 2] > 0 and not depth[0].any()

@@ -14,7 +14,9 @@ import torch
 from zerobev.config import AUX, SCALES, TrainConfig
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.geometry.projection import inverse_project
+from zerobev.inference import Masks, Projector
 from zerobev.models import build
+from zerobev.models.depth import DepthNet
 from zerobev.training import train as training
 from zerobev.training.loader import Batch, batches
 from zerobev.training.train import train, training_accelerator
@@ -146,6 +148,29 @@ def test_the_inverse_projection_is_the_same(device):
     depth = torch.from_numpy(rng.uniform(0.3, 6, (2, 1, side, side)).astype(np.float32))
     expected = inverse_project(zero, depth, SMOKE.camera)
     assert torch.equal(inverse_project(zero.to(device), depth.to(device), SMOKE.camera).cpu(), expected)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("row", ["a.2", "c", "d", "f.r"])
+def test_a_projector_on_the_device_gives_the_maps_of_the_cpu(device, row):
+    """Views, batches and half precision; results are on the CPU."""
+    torch.manual_seed(0)
+    network = None if row == "a.2" else build(row, SMOKE.camera, SMOKE.model).eval()
+    model = Projector(row, SMOKE.camera, network, DepthNet(SMOKE.camera, SMOKE.model).eval())
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (3, 40, 50, 3), dtype=np.uint8)
+    masks = [Masks(rng.random((k, 40, 50)) > 0.7, channels="first") for k in (1, 3, 2)]
+    expected = [model.project(image, mask) for image, mask in zip(images, masks)]
+    there = model.to(device)
+    assert there.device.type == device and model.device.type == "cpu"
+    single = [there.view(image).project(mask) for image, mask in zip(images, masks)]
+    for found in (single, there.project_batch(images, masks)):
+        for one, other in zip(found, expected):
+            # a pixel at the edge of a cell may change its cell
+            assert (np.abs(one.values - other.values) > 1e-3).mean() < 0.01
+    half = there.to(dtype=torch.bfloat16)
+    assert half.device == there.device
+    assert np.abs(half.project(images[0], masks[0]).values - expected[0].values).mean() < 0.03
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
