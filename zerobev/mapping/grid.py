@@ -47,6 +47,12 @@ class Grid:
         rows, columns = self.shape
         return self.x0, self.y0, self.x0 + columns * self.cell_m, self.y0 + rows * self.cell_m
 
+    @property
+    def centres(self) -> tuple[np.ndarray, np.ndarray]:
+        """x of the cells' centres per column, (C,), and y per row, (R,); float64, metres."""
+        rows, columns = (np.arange(length) + 0.5 for length in self.shape)
+        return self.x0 + columns * self.cell_m, self.extent[3] - rows * self.cell_m
+
     def part(self, window: Window) -> "Grid":
         """The grid of a part of the cells."""
         rows, columns = window
@@ -72,13 +78,9 @@ class Grid:
         c, s = math.cos(pose.yaw), math.sin(pose.yaw)
         right, forward = np.array([-half, half, -half, half]), np.array([0, 0, 2 * half, 2 * half])
         x, y = pose.x + right * s + forward * c, pose.y - right * c + forward * s
-        rows, columns = (np.arange(length) + 0.5 for length in self.shape)
-        window = (
-            _between((self.extent[3] - y) / self.cell_m, len(rows)),
-            _between((x - self.x0) / self.cell_m, len(columns)),
-        )
-        dx = self.x0 + columns[None, window[1]] * self.cell_m - pose.x
-        dy = self.extent[3] - rows[window[0], None] * self.cell_m - pose.y
+        rows, columns = self.shape
+        window = _between((self.extent[3] - y) / self.cell_m, rows), _between((x - self.x0) / self.cell_m, columns)
+        dx, dy = self.centres[0][None, window[1]] - pose.x, self.centres[1][window[0], None] - pose.y
         column = np.floor((dx * s - dy * c + half) / camera.cell_m + _TIE).astype(int)
         row = side - 1 - np.floor((dx * c + dy * s) / camera.cell_m + _TIE).astype(int)
         inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
