@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -58,6 +58,12 @@ class Case(NamedTuple):
     poses: str  #: "exact" or "drifting"
     views: int
     cells: str  #: of `CELLS`
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """The inverse of its values separated by spaces."""
+        row, poses, views, cells = text.split()
+        return cls(row, poses, int(views), cells)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,11 +23,13 @@ from zerobev.mapping.grid import Grid, Window
 from zerobev.mapping.nav2 import FREE, OCCUPIED, UNKNOWN, write_nav2
 from zerobev.mapping.pose import Pose2D
 
-#: Largest absolute log-odds from one view, a probability of 0.9: networks are too sure of themselves, and P^-1 has only
-#: the values 0 and 1.
-VIEW_LIMIT = 2.2
+#: Probability of a cell before any view, the one of white in training (`TextureConfig.white_fraction`). A view with
+#: this value says nothing.
+PRIOR = 0.2
+#: Smallest and largest probability from one view: networks are too sure of themselves, and P^-1 has only 0 and 1.
+LOWEST, HIGHEST = 0.05, 0.9
 #: Largest absolute log-odds of a cell, so that a few views can correct many wrong ones.
-CELL_LIMIT = 6.0
+LIMIT = 6.0
 
 _SEEN, _UNSEEN = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
 _MAX_LEGEND = 12
@@ -45,7 +47,8 @@ class _Layer:
 
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> Self:
-        return cls(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.int32))
+        log_odds = np.full(shape, logit(PRIOR), np.float32)
+        return cls(log_odds, np.zeros(shape, np.float32), np.zeros(shape, np.int32))
 
     def part(self, window: Window) -> "_Layer":
         """The sums of a part of the cells; they share memory with these."""
@@ -53,8 +56,8 @@ class _Layer:
 
     def add(self, visible: np.ndarray, values: np.ndarray) -> None:
         """Add a view: its values (N,) in the N cells of the mask `visible` (R, C)."""
-        log_odds = self.log_odds[visible] + np.clip(logit(values), -VIEW_LIMIT, VIEW_LIMIT)
-        self.log_odds[visible] = np.clip(log_odds, -CELL_LIMIT, CELL_LIMIT)
+        evidence = logit(np.clip(values, LOWEST, HIGHEST)) - np.float32(logit(PRIOR))
+        self.log_odds[visible] = np.clip(self.log_odds[visible] + evidence, -LIMIT, LIMIT)
         self.total[visible] += values
         self.views[visible] += 1
 
@@ -62,9 +65,10 @@ class _Layer:
 class HomeMap:
     """Layers by name (classes, instances, any modality) on one grid, fused from any number of projected maps.
 
-    A view changes only the cells in its field of view. Their log-odds grow by the logit of the view's value, which is
-    limited by `VIEW_LIMIT`, and stay within `CELL_LIMIT`. Below that limit the order of views does not matter. A
-    layer starts with the first view that contains it; for earlier views it is unknown.
+    A view changes only the cells in its field of view: their log-odds grow by those of its value, between `LOWEST` and
+    `HIGHEST`, over those of `PRIOR`. After one view a cell has the view's probability. The order of views does not
+    matter unless a cell reaches `LIMIT`. A layer starts with the first view that contains it; for earlier views it is
+    unknown.
     """
 
     def __init__(self, extent: Sequence[float], cell_m: float) -> None:
@@ -94,13 +98,17 @@ class HomeMap:
         return {name: layer.log_odds > 0 for name, layer in self._layers.items()}
 
     def probabilities(self, layer: str) -> np.ndarray:
-        """(R, C) float32: fused probability of a layer, 1/2 where nothing is known. Raises `InputError` if unknown."""
+        """(R, C) float32: fused probability of a layer, `PRIOR` where it was not in view.
+
+        Raises `InputError` for an unknown layer.
+        """
         return expit(self._layer(layer).log_odds)
 
     def means(self, layer: str) -> np.ndarray:
         """(R, C) float32: mean over views of a layer's values, NaN where it was not in view.
 
-        For real values that are no probabilities, such as a temperature in [0, 1]. Raises `InputError` if unknown.
+        For real values that are no probabilities, such as a temperature in [0, 1]. Raises `InputError` for an unknown
+        layer.
         """
         found = self._layer(layer)
         empty = np.full(self.grid.shape, np.nan, np.float32)

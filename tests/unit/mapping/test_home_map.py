@@ -14,7 +14,7 @@ from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
 from zerobev.inference import BevArrows, BevMap
 from zerobev.mapping import HomeMap, Pose2D
-from zerobev.mapping.home_map import CELL_LIMIT, VIEW_LIMIT
+from zerobev.mapping.home_map import HIGHEST, LIMIT, LOWEST, PRIOR
 
 #: A map of 4 x 4 cells of 1 m: row 0 is 3 to 4 m ahead, column 0 is 1 to 2 m to the left.
 CAMERA = CameraConfig(fpv_px=8, bev_px=4, bev_extent_m=4.0)
@@ -61,7 +61,7 @@ def test_a_cell_of_a_view_lies_where_the_pose_puts_it(yaw: float, expected: tupl
     home.add(one_cell(row=1, column=3), Pose2D(10, 20, yaw))
     assert cells_of(home) == {expected}
     assert home.probabilities("chair")[home.seen] == pytest.approx(SOME)
-    assert (home.probabilities("chair")[~home.seen] == 0.5).all()
+    assert home.probabilities("chair")[~home.seen] == pytest.approx(PRIOR)
 
 
 def test_row_0_is_at_the_largest_y_and_column_0_at_the_smallest_x():
@@ -78,17 +78,17 @@ def test_each_cell_takes_the_value_of_the_cell_around_its_centre(x: float, y: fl
     home = HomeMap((-4, -4, 5, 4.7), cell_m)
     home.add(view(values), Pose2D(x, y, yaw))
     left, _, _, top = home.grid.extent
-    for row, column in np.ndindex(*(side // 3 for side in home.grid.shape)):
-        row, column = 3 * row, 3 * column
+    found, seen = home.probabilities("chair"), home.seen
+    for row, column in np.ndindex(*(side // 4 for side in home.grid.shape)):
+        row, column = 4 * row, 4 * column
         centre = complex(left + (column + 0.5) * cell_m, top - (row + 0.5) * cell_m)
         local = (centre - complex(x, y)) * np.exp(-1j * yaw)
         across, ahead = 2 - local.imag, local.real
         if min(abs(value - round(value)) for value in (across, ahead)) < 1e-4:
             continue  # on a border between two cells
         on_map = 0 <= across < 4 and 0 <= ahead < 4
-        expected = values[0, 3 - int(ahead), int(across)] if on_map else 0.5
-        assert home.probabilities("chair")[row, column] == pytest.approx(expected, abs=1e-6)
-        assert home.seen[row, column] == on_map
+        expected = values[0, 3 - int(ahead), int(across)] if on_map else PRIOR
+        assert abs(found[row, column] - expected) < 1e-6 and seen[row, column] == on_map
 
 
 def test_parts_outside_the_extent_are_left_out():
@@ -117,11 +117,14 @@ def fused(*values: float) -> float:
 
 
 def test_log_odds_by_hand():
-    assert fused(0.8, 0.6) == pytest.approx((4 * 1.5) / (4 * 1.5 + 1))
-    assert fused(0.8, 0.2) == pytest.approx(0.5) and fused(0, 1) == 0.5  # two views that contradict each other
-    assert fused(1, 1, 0) == fused(1) == pytest.approx(1 / (1 + math.exp(-VIEW_LIMIT)))
-    assert fused(*[1] * 50) == pytest.approx(1 / (1 + math.exp(-CELL_LIMIT)))
-    assert fused(*[1] * 50, 0, 0, 0) < 0.5  # a wrong cell recovers
+    assert fused(0.7) == pytest.approx(0.7)
+    odds = [p / (1 - p) for p in (0.8, 0.6, PRIOR)]
+    assert fused(0.8, 0.6) == pytest.approx(1 / (1 + odds[2] / (odds[0] * odds[1])))
+    assert fused(0.8, PRIOR, PRIOR) == pytest.approx(0.8)  # a view with the prior says nothing
+    assert fused(0) == pytest.approx(LOWEST) and fused(1) == pytest.approx(HIGHEST)
+    assert fused(0.8, 0.1) < 0.8 and fused(1, 0) > 0.5 > fused(1, 0, 0)  # views that contradict each other
+    assert fused(*[1] * 50) == pytest.approx(1 / (1 + math.exp(-LIMIT)))
+    assert fused(*[1] * 50, *[0] * 4) < 0.5  # a wrong cell recovers
 
 
 VALUES = arrays(np.float32, (2, 4, 4), elements=st.floats(0, 1, width=32))
@@ -131,7 +134,7 @@ POSES = st.builds(Pose2D, st.floats(0, 6), st.floats(0, 6), st.floats(-6, 6))
 
 @given(st.lists(st.tuples(VALUES, FOVS, POSES), min_size=2, max_size=2))
 def test_the_order_of_views_does_not_matter_below_the_limit(views):
-    """Two views stay below it: 2 * VIEW_LIMIT < CELL_LIMIT."""
+    """Two views do not reach it."""
     homes = [HomeMap((0, 0, 6, 6), 0.5) for _ in range(2)]
     for home in homes:
         for values, fov, pose in views:
@@ -148,7 +151,7 @@ def test_nothing_changes_outside_the_field_of_view(values, fov, pose):
     home = HomeMap((0, 0, 6, 6), 0.5)
     home.add(view(values, ("chair", "sofa"), fov), pose)
     for name in home.layers:
-        assert (home.probabilities(name)[~home.seen] == 0.5).all()
+        assert home.probabilities(name)[~home.seen] == pytest.approx(PRIOR)
         assert np.isnan(home.means(name)[~home.seen]).all() and not home.maps[name][~home.seen].any()
 
 
@@ -160,7 +163,7 @@ def test_a_layer_starts_with_its_first_view():
     ahead, behind = np.zeros((2, 8, 8), bool)
     ahead[2:6, 4:], behind[2:6, :4] = True, True
     assert np.array_equal(home.maps["floor"], ahead | behind) and np.array_equal(home.maps["edges"], behind)
-    assert (home.probabilities("edges")[ahead] == 0.5).all() and np.isnan(home.means("edges")[ahead]).all()
+    assert home.probabilities("edges")[ahead] == pytest.approx(PRIOR) and np.isnan(home.means("edges")[ahead]).all()
 
 
 def test_values_that_are_no_probabilities_have_a_mean():
