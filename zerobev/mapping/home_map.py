@@ -117,9 +117,10 @@ class HomeMap:
     def add(self, bev: BevMap, pose: Pose2D) -> None:
         """Fuse the map of one view.
 
-        bev: a result of `Projector.project`. Maps of the same name, such as two boxes of a chair, count as one with the
-            larger value. Maps of P^-1 are 0 in cells without a pixel; to leave these unknown, replace `fov` by the map
-            of an all-white mask: `dataclasses.replace(bev, fov=...)`
+        bev: a result of `Projector.project`. Layers that it lacks stay as they are: project the masks of all classes,
+            also the empty ones, so that their absence counts. Maps of the same name, such as two boxes of a chair,
+            count as one with the larger value. Maps of P^-1 are 0 in cells without a pixel; to leave these unknown,
+            replace `fov` by the map of an all-white mask: `dataclasses.replace(bev, fov=...)`
         pose: of the view's camera
         A cell of the home takes the value of the cell of `bev` in which its centre lies. All maps of a home have the
         same grid (cells per side, and their size); the camera of the photographs may change. Parts outside the home's
