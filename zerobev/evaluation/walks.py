@@ -39,9 +39,14 @@ from zerobev.scenes.readers import read_scene
 from zerobev.scenes.scene import Scene
 
 #: Row -> title.
-WALK_ROWS = {row: METHODS[row] for row in (ORACLE, GEOMETRIC, *ROWS, "d.sensor")}
+WALK_ROWS = {
+    ORACLE: METHODS[ORACLE],
+    GEOMETRIC: METHODS[GEOMETRIC],
+    f"{GEOMETRIC}.sensor": "P^-1 with a depth camera",
+    **{row: METHODS[row] for row in (*ROWS, "d.sensor")},
+}
 #: Numbers of views after which maps are compared.
-STAGES = (1, 2, 5, 10, 20, 50, 100)
+STAGES = (1, 2, 5, 10, 20, 40, 60, 80, 100)
 #: Cells that are compared: all in a field of view so far; those of them without a pixel of any view, which P^-1 cannot
 #: know; all in the box around the home.
 CELLS = ("seen", "hidden", "home")
@@ -154,13 +159,14 @@ def walk_maps(walked: Walk, rows: Collection[str] = tuple(WALK_ROWS)) -> dict[st
     measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
     found = {}
     for row in rows:
-        depth = walked.views["depth"] if row == ORACLE else measured if row.endswith(".sensor") else estimated
-        if row in (ORACLE, GEOMETRIC):
+        name = row.removesuffix(".sensor")
+        depth = walked.views["depth"] if row == ORACLE else measured if name != row else estimated
+        if name in (ORACLE, GEOMETRIC):
             zero = walked.views["zero"].float()
             values = inverse_project(zero, depth, walked.camera)
             fov = inverse_project(torch.ones_like(depth), depth, walked.camera)[:, 0].numpy() > 0
         else:
-            network = load(row.removesuffix(".sensor")).network
+            network = load(name).network
             assert network is not None  # as of all shipped rows
             values = _predicted(network, walked.views | {"depth": depth})
             fov = np.stack([fov_mask(one[0], walked.camera) for one in depth.numpy()])
@@ -221,6 +227,6 @@ def evaluate_walks(folders: Iterable[Path], stages: Collection[int] = STAGES, se
 
 
 def walks_table(scores: Mapping[Case, HomeScores]) -> pd.DataFrame:
-    """One line per case: its fields, and `miou` and `bf1`, means over classes in percent."""
+    """One line per case, by number of views: its fields, and `miou` and `bf1`, means over classes in percent."""
     lines = [(*case, *(100 * float(np.nanmean(m)) for m in (s.iou(), s.boundary_f1()))) for case, s in scores.items()]
-    return pd.DataFrame(lines, columns=[*Case._fields, "miou", "bf1"])
+    return pd.DataFrame(lines, columns=[*Case._fields, "miou", "bf1"]).sort_values("views", kind="stable")
