@@ -49,7 +49,7 @@ WALK_ROWS = {
 STAGES = (1, 2, 5, 10, 20, 40, 60, 80, 100)
 #: Cells that are compared: all in a field of view so far; those of them without a pixel of any view, which P^-1 cannot
 #: know; all in the box around the home.
-CELLS = ("seen", "hidden", "home")
+CELLS = ("viewed", "unseen", "home")
 #: Error of the odometry per step, relative to its length; error of its heading, degrees per metre.
 DRIFT, DRIFT_DEG = 0.02, 1.0
 
@@ -197,14 +197,14 @@ def score_walk(walked: Walk, stages: Collection[int], rng: np.random.Generator) 
     maps = walk_maps(walked)
     true_fov = [fov_mask(depth[0], walked.camera) for depth in walked.views["depth"].numpy()]
     in_view = [replace(bev, fov=fov) for bev, fov in zip(maps[ORACLE], true_fov)]
-    seen, with_pixel = ([home.seen for home in walked.fused(each, walked.poses)] for each in (in_view, maps[ORACLE]))
+    viewed, seen = ([home.viewed for home in walked.fused(each, walked.poses)] for each in (in_view, maps[ORACLE]))
     found = {}
     for track, poses in {"exact": walked.poses, "drifting": drifting(walked.poses, rng)}.items():
         for row, each in maps.items():
             for number, home in enumerate(walked.fused(each, poses)):
                 if number + 1 not in stages:
                     continue
-                regions = seen[number], seen[number] & ~with_pixel[number], walked.box
+                regions = viewed[number], viewed[number] & ~seen[number], walked.box
                 predicted = np.stack(list(home.maps.values()))
                 for cells, region in zip(CELLS, regions):
                     found[Case(row, track, number + 1, cells)] = HomeScores.of(predicted, walked.truth, region)

@@ -31,7 +31,7 @@ LOWEST, HIGHEST = 0.05, 0.9
 #: Largest absolute log-odds of a cell, so that a few views can correct many wrong ones.
 LIMIT = 6.0
 
-_SEEN, _UNSEEN = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
+_VIEWED, _OUTSIDE = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
 _MAX_LEGEND = 12
 # a full disk is not among them: it ends every command in the same way
 _CANNOT_WRITE = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
@@ -88,7 +88,7 @@ class HomeMap:
         return tuple(self._layers)
 
     @property
-    def seen(self) -> np.ndarray:
+    def viewed(self) -> np.ndarray:
         """(R, C) bool: cells that were in a field of view."""
         return np.any([np.zeros(self.grid.shape, bool), *(layer.views > 0 for layer in self._layers.values())], axis=0)
 
@@ -141,7 +141,7 @@ class HomeMap:
 
     def crop(self) -> "HomeMap":
         """The smallest part with all cells that were in view. Raises `InputError` if there are none."""
-        row, column = np.nonzero(self.seen)
+        row, column = np.nonzero(self.viewed)
         if not len(row):
             raise InputError("map: expected cells in the field of view of a view, found none")
         window = slice(int(row.min()), int(row.max()) + 1), slice(int(column.min()), int(column.max()) + 1)
@@ -155,7 +155,7 @@ class HomeMap:
 
     def image(self) -> np.ndarray:
         """(R, C, 3) float64: a colour per layer, smaller ones above larger ones; white where nothing was in view."""
-        image = np.where(self.seen[..., None], _SEEN, _UNSEEN)
+        image = np.where(self.viewed[..., None], _VIEWED, _OUTSIDE)
         maps = list(self.maps.values())
         for k in sorted(range(len(maps)), key=lambda k: -maps[k].sum()):
             image = np.where(maps[k][..., None], color_of(k), image)

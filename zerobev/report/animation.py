@@ -46,9 +46,9 @@ def walk_animation(
         panel.tick_params(labelsize=6)
     x, y = (np.array([getattr(pose, axis) for pose in poses]) for axis in ("x", "y"))
     frames = []
-    for views, classes, seen in maps:
+    for views, classes, viewed in maps:
         photograph.set_data(photographs[views - 1])
-        growing.set_data(maps_image(classes, seen))
+        growing.set_data(maps_image(classes, viewed))
         way.set_data(x[:views], y[:views])
         camera.set_data(x[views - 1 : views], y[views - 1 : views])
         panels[0].set_title(f"view {views}", fontsize=8)

@@ -82,7 +82,7 @@ def test_fused_true_maps_are_the_true_map(scene, walked):
     for name, poses in {"exact": walked.poses, "mirrored": [replace(p, yaw=-p.yaw) for p in walked.poses]}.items():
         *_, home = walked.fused(true_maps(scene, walked), poses)
         predicted = np.stack(list(home.maps.values()))
-        scores[name] = HomeScores.of(predicted, walked.truth, home.seen & walked.box)
+        scores[name] = HomeScores.of(predicted, walked.truth, home.viewed & walked.box)
     present = walked.truth.any(axis=(1, 2))
     assert present.sum() == 4  # walls, seen from inside alone, have no upper side
     assert scores["exact"].iou()[present].min() > 0.8 and scores["exact"].boundary_f1()[present].min() > 0.95
@@ -133,7 +133,7 @@ def test_scores_of_a_walk(walked, monkeypatch):
         # true cells: both maps have the same ones, whatever the row and the poses
         alike = scores[case._replace(row="a.1", poses="exact")]
         assert np.array_equal(score.recall.union, alike.recall.union)
-        if case.row == "a.1" and case.poses == "exact" and case.cells == "hidden":
+        if case.row == "a.1" and case.poses == "exact" and case.cells == "unseen":
             assert not score.precision.union.any()  # cells without a pixel stay unknown to P^-1
     oracle = [np.nanmean(scores[Case("a.1", "exact", views, "home")].iou()) for views in (1, VIEWS)]
     assert oracle[1] > 2 * oracle[0] > 0

@@ -38,7 +38,7 @@ def one_cell(row: int, column: int) -> BevMap:
 def cells_of(home: HomeMap) -> set[tuple[int, int]]:
     """The world's cells of 1 m that were in view, by their lower left corners."""
     x0, _, _, y1 = home.grid.extent
-    return {(int(x0) + column, int(y1) - 1 - row) for row, column in np.argwhere(home.seen).tolist()}
+    return {(int(x0) + column, int(y1) - 1 - row) for row, column in np.argwhere(home.viewed).tolist()}
 
 
 # --- geometry -----------------------------------------------------------------------------------------------------
@@ -60,15 +60,15 @@ def test_a_cell_of_a_view_lies_where_the_pose_puts_it(yaw: float, expected: tupl
     home = HomeMap((0, 10, 30, 40), 1.0)
     home.add(one_cell(row=1, column=3), Pose2D(10, 20, yaw))
     assert cells_of(home) == {expected}
-    assert home.probabilities("chair")[home.seen] == pytest.approx(SOME)
-    assert home.probabilities("chair")[~home.seen] == pytest.approx(PRIOR)
+    assert home.probabilities("chair")[home.viewed] == pytest.approx(SOME)
+    assert home.probabilities("chair")[~home.viewed] == pytest.approx(PRIOR)
 
 
 def test_row_0_is_at_the_largest_y_and_column_0_at_the_smallest_x():
     home = HomeMap((-2, 1, 3, 4), 0.5)
     home.add(one_cell(row=3, column=2), Pose2D(2, 1, math.pi / 2))  # x from 2 to 3, y from 1 to 2
     assert home.grid.shape == (6, 10)
-    assert np.array_equal(np.argwhere(home.seen), [(row, column) for row in (4, 5) for column in (8, 9)])
+    assert np.array_equal(np.argwhere(home.viewed), [(row, column) for row in (4, 5) for column in (8, 9)])
 
 
 @given(x=st.floats(-3, 3), y=st.floats(-3, 3), yaw=st.floats(-6, 6), cell_m=st.sampled_from([0.1, 0.25, 0.4]))
@@ -78,7 +78,7 @@ def test_each_cell_takes_the_value_of_the_cell_around_its_centre(x: float, y: fl
     home = HomeMap((-4, -4, 5, 4.7), cell_m)
     home.add(view(values), Pose2D(x, y, yaw))
     left, _, _, top = home.grid.extent
-    found, seen = home.probabilities("chair"), home.seen
+    found, viewed = home.probabilities("chair"), home.viewed
     for row, column in np.ndindex(*(side // 4 for side in home.grid.shape)):
         row, column = 4 * row, 4 * column
         centre = complex(left + (column + 0.5) * cell_m, top - (row + 0.5) * cell_m)
@@ -88,7 +88,7 @@ def test_each_cell_takes_the_value_of_the_cell_around_its_centre(x: float, y: fl
             continue  # on a border between two cells
         on_map = 0 <= across < 4 and 0 <= ahead < 4
         expected = values[0, 3 - int(ahead), int(across)] if on_map else PRIOR
-        assert abs(found[row, column] - expected) < 1e-6 and seen[row, column] == on_map
+        assert abs(found[row, column] - expected) < 1e-6 and viewed[row, column] == on_map
 
 
 def test_parts_outside_the_extent_are_left_out():
@@ -113,7 +113,7 @@ def fused(*values: float) -> float:
     home = HomeMap((0, 0, 8, 8), 1.0)
     for value in values:
         home.add(view(value), Pose2D(4, 4, 0))
-    return float(home.probabilities("chair")[home.seen].mean())
+    return float(home.probabilities("chair")[home.viewed].mean())
 
 
 def test_log_odds_by_hand():
@@ -143,7 +143,7 @@ def test_the_order_of_views_does_not_matter_below_the_limit(views):
     for name in ("chair", "sofa"):
         np.testing.assert_allclose(*(home.probabilities(name) for home in homes), atol=1e-6)
         np.testing.assert_allclose(*(home.means(name) for home in homes), atol=1e-6)
-    assert np.array_equal(homes[0].seen, homes[1].seen)
+    assert np.array_equal(homes[0].viewed, homes[1].viewed)
 
 
 @given(VALUES, FOVS, POSES)
@@ -151,8 +151,8 @@ def test_nothing_changes_outside_the_field_of_view(values, fov, pose):
     home = HomeMap((0, 0, 6, 6), 0.5)
     home.add(view(values, ("chair", "sofa"), fov), pose)
     for name in home.layers:
-        assert home.probabilities(name)[~home.seen] == pytest.approx(PRIOR)
-        assert np.isnan(home.means(name)[~home.seen]).all() and not home.maps[name][~home.seen].any()
+        assert home.probabilities(name)[~home.viewed] == pytest.approx(PRIOR)
+        assert np.isnan(home.means(name)[~home.viewed]).all() and not home.maps[name][~home.viewed].any()
 
 
 def test_a_layer_starts_with_its_first_view():
@@ -170,7 +170,7 @@ def test_values_that_are_no_probabilities_have_a_mean():
     home = HomeMap((0, 0, 8, 8), 1.0)
     for value in (0.9, 0.9, 0.3):
         home.add(view(value, ["heat"]), Pose2D(4, 4, 0))
-    assert home.means("heat")[home.seen] == pytest.approx(0.7)
+    assert home.means("heat")[home.viewed] == pytest.approx(0.7)
 
 
 def test_two_maps_of_one_name_are_one_map():
@@ -180,7 +180,7 @@ def test_two_maps_of_one_name_are_one_map():
     home = HomeMap((0, 0, 8, 8), 1.0)
     home.add(view(values, ("chair", "chair")), Pose2D(4, 4, 0))
     assert home.layers == ("chair",) and home.maps["chair"].sum() == 2
-    assert home.means("chair")[home.seen].sum() == 2
+    assert home.means("chair")[home.viewed].sum() == 2
 
 
 # --- crop, files, pictures ------------------------------------------------------------------------------------------
@@ -197,8 +197,8 @@ def walked() -> HomeMap:
 def test_a_cropped_map_has_the_same_cells_at_the_same_places():
     home = walked()
     part = home.crop()
-    assert part.seen.any(axis=0)[[0, -1]].all() and part.seen.any(axis=1)[[0, -1]].all()
-    assert part.seen.sum() == home.seen.sum()
+    assert part.viewed.any(axis=0)[[0, -1]].all() and part.viewed.any(axis=1)[[0, -1]].all()
+    assert part.viewed.sum() == home.viewed.sum()
     offset = (np.array(part.grid.extent) - home.grid.extent) / 0.5
     left, bottom, right, top = np.rint(offset).astype(int)
     np.testing.assert_allclose(offset, np.rint(offset), atol=1e-9)
