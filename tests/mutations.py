@@ -174,6 +174,42 @@ MUTATIONS = (
         "module.to(device, dtype)",
         ("tests/unit/inference/test_image_view.py::test_precision_is_a_copy_s_and_changes_maps_by_rounding_alone",),
     ),
+    # the map of a home
+    Mutation(
+        "maps turned to the other side",
+        "zerobev/mapping/grid.py",
+        "(dx * s - dy * c + half)",
+        "(dy * c - dx * s + half)",
+        ("tests/unit/mapping/test_home_map.py",),
+    ),
+    Mutation(
+        "evidence also outside the field of view",
+        "zerobev/mapping/home_map.py",
+        "visible = inside & bev.fov[row, column]",
+        "visible = inside",
+        ("tests/unit/mapping/test_home_map.py",),
+    ),
+    Mutation(
+        "unknown cells free for a robot",
+        "zerobev/mapping/nav2.py",
+        "_OCCUPIED_FROM, _FREE_BELOW = 0.65, 0.196",
+        "_OCCUPIED_FROM, _FREE_BELOW = 0.65, 0.25",
+        ("tests/unit/mapping/test_nav2.py",),
+    ),
+    Mutation(
+        "a map for robots upside down",
+        "zerobev/mapping/nav2.py",
+        "image.astype(np.uint8)",
+        "image[::-1].astype(np.uint8)",
+        ("tests/unit/mapping/test_nav2.py",),
+    ),
+    Mutation(
+        "a true map of a home one cell to the side",
+        "zerobev/evaluation/walks.py",
+        "Pose(grid.x0 + side / 2,",
+        "Pose(grid.x0 + side / 2 + grid.cell_m,",
+        ("tests/unit/evaluation/test_walks.py::test_the_true_map_is_that_of_a_view_on_the_same_grid",),
+    ),
     # the zero-shot stream
     Mutation(
         "zero-shot image one pixel to the right",

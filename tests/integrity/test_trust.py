@@ -13,7 +13,7 @@ import pytest
 from zerobev.benchmarks.run import recorded_benchmark
 from zerobev.config import SCALES
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.recorded import recorded_motion, recorded_unseen
+from zerobev.experiments.recorded import recorded_motion, recorded_unseen, recorded_walks
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunStore
 from zerobev.experiments.runs import recorded
@@ -65,6 +65,7 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
         (recorded_benchmark, "zerobev.benchmarks.run.measure"),
         (recorded_motion, "zerobev.experiments.recorded.ensure_homes"),
         (recorded_unseen, "zerobev.experiments.recorded.ensure_homes"),
+        (recorded_walks, "zerobev.experiments.recorded.ensure_homes"),
     ],
 )
 def test_measurements_were_made_by_this_code(monkeypatch, read, starts_with: str):

@@ -1,4 +1,4 @@
-"""Recorded results of the shipped weights: motion, unseen modalities, other cameras, other depth.
+"""Recorded results of the shipped weights: motion, unseen modalities, other cameras, other depth, walks.
 
 The networks run on the CPU.
 """
@@ -7,19 +7,23 @@ from typing import Any
 
 import pandas as pd
 
+from zerobev.evaluation.home_scores import HomeScores
 from zerobev.evaluation.metrics import Counts
 from zerobev.evaluation.motion import evaluate_motion, moving_pairs
 from zerobev.evaluation.other_cameras import CAMERAS, POSES, CameraCounts, evaluate_cameras
 from zerobev.evaluation.real_homes import evaluate_homes
 from zerobev.evaluation.unseen import VIEWS, evaluate_unseen
+from zerobev.evaluation.walks import STAGES, Case, evaluate_walks
 from zerobev.experiments.records import recorded
 from zerobev.experiments.workspace import Workspace
 from zerobev.inference.shipped_weights import shipped_runs
+from zerobev.mapping import home_map
 from zerobev.scenes.homes import ensure_homes
 
 PAIRS = 32  #: of photographs, for motion
 HOMES = 8  #: photographed by other cameras
 DEPTH_VIEWS = 12  #: per home, with depth of each kind
+WALKS = 4  #: homes to walk through
 
 
 def recorded_motion(workspace: Workspace) -> pd.DataFrame:
@@ -78,3 +82,22 @@ def recorded_homes(workspace: Workspace) -> dict[str, Any]:
 
     config = {"weights": shipped_runs(), "views": DEPTH_VIEWS, "scenes": workspace.scale.scenes}
     return recorded(workspace.reports / "homes.json", "homes", config, compute, device="cpu")
+
+
+def recorded_walks(workspace: Workspace) -> dict[Case, HomeScores]:
+    """`evaluate_walks` in the first `WALKS` generated test homes; recorded in `walks.json` of the report."""
+    homes = list(workspace.split.test[:WALKS])
+
+    def compute() -> dict[str, Any]:
+        ensure_homes(homes, workspace.scale.scenes.seed, 1)
+        return {" ".join(map(str, case)): scores.to_json() for case, scores in evaluate_walks(homes, STAGES).items()}
+
+    config = {
+        "weights": shipped_runs(),
+        "homes": len(homes),
+        "stages": STAGES,
+        "fusion": [home_map.PRIOR, home_map.LOWEST, home_map.HIGHEST, home_map.LIMIT],
+        "scenes": workspace.scale.scenes,
+    }
+    found = recorded(workspace.reports / "walks.json", "walks", config, compute, device="cpu")
+    return {Case.parse(case): HomeScores.from_json(counts) for case, counts in found.items()}
