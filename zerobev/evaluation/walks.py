@@ -25,7 +25,8 @@ from zerobev.evaluation.real_homes import METHODS, ORACLE
 from zerobev.geometry.cameras import Pose
 from zerobev.geometry.projection import fov_mask, inverse_project
 from zerobev.inference.bev_map import BevMap
-from zerobev.inference.projector import GEOMETRIC, load
+from zerobev.inference.pretrained import GEOMETRIC
+from zerobev.inference.projector import load
 from zerobev.inference.shipped_weights import ROWS
 from zerobev.mapping.grid import Grid
 from zerobev.mapping.home_map import HomeMap
