@@ -26,21 +26,40 @@ _FLOOR_WIDTH = 1 / 32
 _MIN_LOGIT = -4.0
 
 
-def noisy_or(closed: Tensor, values: Tensor) -> Tensor:
-    """1 - prod_y (1 - g_y)^h_y for gates g and values h in [0, 1], per modality.
+def closing(logits: Tensor) -> Tensor:
+    """-log(1 - g) of gates g = sigmoid(logits), in the type of the logits, also under autocast."""
+    with torch.autocast(logits.device.type, enabled=False):
+        return F.softplus(logits)
 
-    For binary values this is 1 - prod_y (1 - g_y h_y), between the maximum of g_y h_y and their sum; for binary gates,
-    too, the maximum over the pixels with an open gate. It is monotone in every value. A value between 0 and 1 is that
-    fraction of a white pixel.
 
-    closed: (..., P, R), -log(1 - g) of P positions over R pixels, `softplus` of the gates' logits
-    values: (..., R, K) of K modalities
+def binary_or(gates: Tensor, values: Tensor) -> Tensor:
+    """`noisy_or` for binary values: one matrix product for all modalities.
+
+    gates: (..., P, R), `closing` of their logits
+    values: (..., R, K) of K modalities, 0 or 1; a value in between counts as this fraction of a pixel,
+        1 - prod_y (1 - g_y)^h_y
     Returns (..., P, K) float32 in [0, 1].
     """
-    # the logarithm is one matrix product for all modalities
-    with torch.autocast(closed.device.type, enabled=False):
-        logarithm = -(closed @ values.to(closed.dtype))
-    return -torch.expm1(logarithm.float())
+    with torch.autocast(gates.device.type, enabled=False):
+        closed = -(gates @ values.to(gates.dtype))  # log (1 - g h) = h log (1 - g)
+    return -torch.expm1(closed.float())
+
+
+def noisy_or(logits: Tensor, values: Tensor) -> Tensor:
+    """1 - prod_y (1 - g_y h_y) for gates g = sigmoid(logits) and values h in [0, 1], per modality.
+
+    For binary gates and values this is the maximum over the pixels with an open gate. In general it lies between the
+    maximum of g_y h_y and their sum, and is monotone in every value.
+
+    logits: (..., P, R) of P positions over R pixels
+    values: (..., R, K) of K modalities
+    Returns (..., P, K) in [0, 1].
+    """
+    if bool(((values == 0) | (values == 1)).all()):
+        return binary_or(closing(logits), values)
+    gates = logits.sigmoid().float().clamp(max=1 - 1e-6)
+    closed = torch.stack([torch.log1p(-gates * h[..., None, :]).sum(-1) for h in values.unbind(-1)], dim=-1)
+    return -torch.expm1(closed.float())
 
 
 class Gates(nn.Module):
@@ -89,17 +108,15 @@ class MaxPoolZeroBEV(ZeroShotModel):
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
 
     def image_features(self, rgb: Tensor) -> Features:
-        """Gates (B, W, P, H), as for `noisy_or`, and features on the map (B, width, M, M)."""
+        """`closing` of the gates (B, W, P, H), and features on the map (B, width, M, M)."""
         (features,) = self.pyramid(self.backbone(rgb))
         gates = self.gates(features)
-        with torch.autocast(gates.device.type, enabled=False):
-            closed = F.softplus(gates)
-        return closed, self.map_features(features, gates)
+        return closing(gates), self.map_features(features, gates)
 
     def project_images(self, features: Features, zero: Tensor, projected: Tensor | None) -> MapLogits:
         """As `ZeroShotModel.project_images`."""
-        closed, map_features = features
-        pooled = noisy_or(closed, zero.permute(0, 3, 2, 1))  # B W P K
+        gates, map_features = features
+        pooled = binary_or(gates, zero.permute(0, 3, 2, 1))  # B W P K
         pooled = self.resample_pixels(pooled)[0].permute(0, 3, 1, 2)  # B K M M
         maps = pooled[:, :, None] if projected is None else torch.cat([pooled[:, :, None], projected], dim=2)
         embedded = self.embedding(maps.flatten(0, 1).to(zero.dtype)).unflatten(0, zero.shape[:2])

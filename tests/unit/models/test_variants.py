@@ -18,7 +18,7 @@ from zerobev.config import AUX, LABELS, SCALES, CameraConfig
 from zerobev.geometry.projection import inverse_project, map_points
 from zerobev.models import VARIANTS, BevModel, ZeroBEV, build, load_model
 from zerobev.models.fpv_to_bev import reweigh
-from zerobev.models.max_pooling import noisy_or
+from zerobev.models.max_pooling import binary_or, closing, noisy_or
 from zerobev.models.polar import band_rows
 from zerobev.report.paper import PARAMETERS_M
 from zerobev.report.parameters import parameters
@@ -336,7 +336,7 @@ def test_noisy_or_max_pools_the_values_of_open_gates(seed):
     open_, values = rng.random((3, 5, 7)) < 0.3, rng.random((3, 7, 4)) < 0.5
     logits = torch.from_numpy(np.where(open_, 40.0, -40.0)).float()
     expected = (open_[..., None] & values[:, None]).any(axis=2)
-    found = noisy_or(F.softplus(logits), torch.from_numpy(values).float())
+    found = noisy_or(logits, torch.from_numpy(values).float())
     torch.testing.assert_close(found, torch.from_numpy(expected).float(), atol=1e-6, rtol=0)
 
 
@@ -345,20 +345,21 @@ def test_noisy_or_max_pools_the_values_of_open_gates(seed):
 def test_noisy_or_is_between_the_largest_term_and_the_sum_and_is_monotone(seed):
     torch.manual_seed(seed)
     logits, values = 3 * torch.randn(2, 5, 7), torch.rand(2, 7, 4)
-    closed, gates, binary = F.softplus(logits), logits.sigmoid(), (values > 0.5).float()
-    terms = gates[..., None] * binary[:, None]  # 2 5 7 4
-    found = noisy_or(closed, binary)
+    terms = logits.sigmoid()[..., None] * values[:, None]  # 2 5 7 4
+    found = noisy_or(logits, values)
     torch.testing.assert_close(found, 1 - (1 - terms).prod(2), atol=1e-5, rtol=1e-5)
     assert (found >= terms.amax(2) - 1e-5).all() and (found <= terms.sum(2) + 1e-5).all()
-    # a value between 0 and 1 is that fraction of a white pixel
-    found = noisy_or(closed, values)
-    powers = (1 - gates)[..., None] ** values[:, None]
-    torch.testing.assert_close(found, 1 - powers.prod(2), atol=1e-5, rtol=1e-4)
     raised = values.clone()
     raised[:, 3] += (1 - raised[:, 3]) / 2
-    assert (noisy_or(closed, raised) >= found - 1e-6).all()
+    assert (noisy_or(logits, raised) >= found - 1e-6).all()
     order = torch.randperm(4)
-    torch.testing.assert_close(noisy_or(closed, values[..., order]), found[..., order])
+    torch.testing.assert_close(noisy_or(logits, values[..., order]), found[..., order])
+    # the faster form for binary values is the same function
+    binary = (values > 0.5).float()
+    torch.testing.assert_close(noisy_or(logits, binary), noisy_or(logits, binary * (1 - 1e-7)), atol=1e-4, rtol=1e-4)
+    # in a network, other values count as fractions of a pixel
+    powers = (1 - logits.sigmoid())[..., None] ** values[:, None]
+    torch.testing.assert_close(binary_or(closing(logits), values), 1 - powers.prod(2), atol=1e-5, rtol=1e-4)
 
 
 @torch.no_grad()
@@ -368,7 +369,7 @@ def test_with_one_gate_per_pixel_the_pooled_map_is_the_projection():
     net, camera = network("f"), SMOKE.camera
     row = camera.bev_px - 1 - (batch["depth"][:, 0] / camera.cell_m).floor().long()  # B H W
     reached = row.permute(0, 2, 1)[:, :, None] == torch.arange(camera.bev_px)[:, None]  # B W P H
-    pooled = noisy_or(F.softplus(torch.where(reached, 40.0, -40.0)), batch["zero"].permute(0, 3, 2, 1))
+    pooled = noisy_or(torch.where(reached, 40.0, -40.0), batch["zero"].permute(0, 3, 2, 1))
     on_map = net.resample_pixels(pooled)[0][..., 0]
     projected = inverse_project(batch["zero"], batch["depth"], camera)[:, 0]
     inside = (batch["fov"][:, 0] > 0) & net.resample_pixels.valid
