@@ -170,6 +170,7 @@ class ModelConfig:
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
     seen: bool = False  #: beside that, which cells P^-1 sees at all
     floor_depth: bool = False  #: estimated depth is at most that of the floor
+    own_rays: bool = False  #: the depth estimator reads the rays of the image's own camera, from its height
     segmentation: bool = False  #: masks of the eight classes as input (TIM, row (b.3))
 
 
@@ -211,7 +212,7 @@ class Scale:
     extruded_fraction: float = 0.0  #: fraction of *Synth* samples with extruded textures (not in the paper)
     objects_fraction: float = 0.0  #: fraction of *Synth* samples with whole instances in white (not in the paper)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    log_depth: bool = False  #: the depth estimator's loss compares logarithms (not in the paper)
+    relative_depth: bool = False  #: the depth estimator's loss is the relative error (not in the paper)
     mixed_depth: bool = False  #: residual networks are trained with depth of any quality (not in the paper)
     test_views: int | None = None  #: networks are evaluated on the first so many of each test scene; None: all
     #: initial weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
@@ -250,6 +251,7 @@ _REDUCED = Scale(
     extruded_fraction=0.75,
     test_views=24,
 )
+_LARGER = replace(_REDUCED.model, channels=(32, 64, 128, 256), stem_channels=32, stem_stride=4)
 #: Weights for other people's images: more pixels, homes that are less alike, any camera, depth of any quality. The
 #: strides are the paper's; they save as much time as the wider backbone takes.
 _DEPLOY = replace(
@@ -257,14 +259,12 @@ _DEPLOY = replace(
     name="deploy",
     camera=CameraConfig(fpv_px=128, bev_px=40),
     scenes=SceneConfig(train=200, validation=4, test=16, views=60, homes="varied", heights_m=(0.3, 1.8)),
-    model=replace(
-        _REDUCED.model, channels=(32, 64, 128, 256), stem_channels=32, stem_stride=4, seen=True, floor_depth=True
-    ),
+    model=replace(_LARGER, seen=True, floor_depth=True, own_rays=True),
     train=TrainConfig(steps=15_000, learning_rate=2e-3, decay_every=375, decay=0.9, validate_every=1000, warmup=100),
     depth=TrainConfig(steps=20_000, learning_rate=4e-3, decay_every=500, decay=0.9, validate_every=2000, warmup=100),
     objects_fraction=0.5,
-    augment=AugmentConfig(looks=0.9, cameras=0.5, mirrored=0.5),
-    log_depth=True,
+    augment=AugmentConfig(looks=0.9, cameras=0.3, mirrored=0.5),
+    relative_depth=True,
     mixed_depth=True,
 )
 

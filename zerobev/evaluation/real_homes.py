@@ -34,6 +34,7 @@ from zerobev.geometry.projection import inverse_project
 from zerobev.inference.pretrained import GEOMETRIC
 from zerobev.inference.projector import Projector, load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
+from zerobev.models.depth import estimate
 from zerobev.models.variants import VARIANTS
 from zerobev.scenes.readers import list_scenes, read_scene
 from zerobev.training.loader import Batch
@@ -196,7 +197,7 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
     camera = projectors[ROWS[0]].camera
     batch = render_views(folder, views, camera, seed)
     with torch.inference_mode():
-        estimated = projectors[ROWS[0]].estimator(batch["rgb"])
+        estimated = estimate(projectors[ROWS[0]].estimator, batch["rgb"], batch.get("height"))
     pairs = zip(batch["sensor"].numpy(), estimated.numpy())
     measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
     depths = {"": estimated, ".none": torch.zeros_like(estimated), ".true": batch["depth"], ".sensor": measured}

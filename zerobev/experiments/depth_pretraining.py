@@ -23,13 +23,13 @@ from zerobev.experiments.provenance import git_revision, origin, peak_memory_mb
 from zerobev.experiments.records import Record, find, key_of, write
 from zerobev.experiments.workspace import Workspace
 from zerobev.models.depth import DepthNet
-from zerobev.training.depth import depth_errors, depth_objective, log_depth_objective, predict_depth, train_depth
+from zerobev.training.depth import depth_errors, depth_objective, predict_depth, relative_depth_objective, train_depth
 from zerobev.training.distributed import rank_and_world_size
 
 #: The fields of `ModelConfig` that the network depends on.
 _FIELDS = ("width", "block", "depths", "channels", "stem_channels", "stem_stride")
 #: Further such fields, recorded where they differ from their defaults.
-_LATER_FIELDS = ("floor_depth",)
+_LATER_FIELDS = ("floor_depth", "own_rays")
 
 _SEED = 0  # one estimator serves all seeds of all runs
 
@@ -51,7 +51,7 @@ class DepthPretraining:
             | {name: getattr(scale.model, name) for name in _LATER_FIELDS if getattr(scale.model, name)},
             "train": scale.depth,
             "augment": scale.augment,
-        } | ({"log_depth": True} if scale.log_depth else {})
+        } | ({"relative_depth": True} if scale.relative_depth else {})
         #: name of the run, with the fingerprint of its configuration
         self.key = key_of(f"depth-seed{_SEED}", self.config)
         self._folder = workspace.reports
@@ -127,7 +127,7 @@ class DepthPretraining:
             _SEED,
             key=self.key,
             augment=workspace.augmentation,
-            objective=log_depth_objective if scale.log_depth else depth_objective,
+            objective=relative_depth_objective if scale.relative_depth else depth_objective,
         )
         trained = time.monotonic()
         device = next(network.parameters()).device.type

@@ -5,7 +5,7 @@ metadata `camera` contains the camera and the map as JSON. The numbers of photog
 
     zero-shot network: rgb (B, 3, S, S) in [0, 1], zero (B, K, S, S) of 0 and 1 -> logits (B, K, M, M)
     residual network:  also depth (B, 1, S, S), metres, and height_m (B,) of the cameras
-    depth estimator:   rgb (B, 3, S, S) -> depth (B, 1, S, S), metres
+    depth estimator:   rgb (B, 3, S, S) -> depth (B, 1, S, S), metres; with `own_rays` also height_m (B,)
 
 All are float32, and images are those of the level camera of the metadata. A residual network's depth is that of the
 estimator's file (`--row depth`), or of a sensor. The map's value is the sigmoid of the logit.
@@ -97,7 +97,8 @@ def _example(network: BevModel, batch: int, images: int) -> dict[str, Tensor]:
         inputs["zero"] = torch.rand(batch, images, side, side, generator=generator).round()
         if network.config.residual:
             inputs["depth"] = network.camera.bev_extent_m * torch.rand(batch, 1, side, side, generator=generator)
-            inputs["height_m"] = torch.full((batch,), network.camera.height_m)
+    if network.config.own_rays if isinstance(network, DepthNet) else network.config.residual:
+        inputs["height_m"] = network.camera.height_m * (1 + torch.rand(batch, generator=generator))
     return inputs
 
 

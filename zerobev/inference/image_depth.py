@@ -16,7 +16,7 @@ from zerobev.inference.measured_depth import MAX_MEDIAN_M
 from zerobev.inference.pinhole import PinholeView
 from zerobev.inference.placement import placement
 from zerobev.models.decoder import resize
-from zerobev.models.depth import DepthEstimator
+from zerobev.models.depth import DepthEstimator, estimate
 
 
 def image_depths(
@@ -37,7 +37,7 @@ def image_depths(
     known = [None if depth is None else view.depth(depth) for depth, view in zip(measured, views)]
     missing = [n for n, depth in enumerate(known) if depth is None or not (depth > 0)[views[n].covered].all()]
     inputs = [_estimator_input(estimator, photographs[n], views[n], source, network) for n in missing]
-    estimated = dict(zip(missing, _estimates(estimator, inputs, network.fpv_px)))
+    estimated = dict(zip(missing, _estimates(estimator, inputs, network.fpv_px, source.height_m)))
     depths = []
     for number, (depth, view) in enumerate(zip(known, views)):
         if depth is None:
@@ -64,13 +64,14 @@ def _estimator_input(
     return view.photograph(photograph)
 
 
-def _estimates(estimator: DepthEstimator, inputs: Sequence[np.ndarray], side: int) -> list[np.ndarray]:
+def _estimates(estimator: DepthEstimator, inputs: Sequence[np.ndarray], side: int, height_m: float) -> list[np.ndarray]:
     """(side, side) float32 metres per input."""
     device, dtype = placement(estimator)
     depths: list[np.ndarray] = []
     for shape, group in groupby(inputs, lambda image: image.shape[:2]):
         batch = channels_first(list(group))
-        depth = estimator(batch.to(device, dtype)).float().cpu()
+        depth = estimate(estimator, batch.to(device, dtype), torch.full((len(batch),), height_m, device=device))
+        depth = depth.float().cpu()
         _check_estimate(depth, (len(batch), 1, *shape))
         depths.extend(resize(depth, (side, side))[:, 0].numpy())
     return depths

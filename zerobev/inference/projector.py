@@ -25,7 +25,7 @@ from zerobev.inference.placement import placed, placement
 from zerobev.inference.pretrained import Parts, load_parts, save_parts
 from zerobev.inference.shipped_weights import ROWS
 from zerobev.models.base import ZeroShotModel
-from zerobev.models.depth import DepthEstimator
+from zerobev.models.depth import DepthEstimator, estimate
 
 #: The networks' camera: level, 0.88 m above the floor, 79 degrees.
 LEVEL = Camera()
@@ -185,7 +185,8 @@ class Projector:
         """A batch of `data.samples` -> maps (B, K, M, M) bool, for `evaluation.evaluate`; with estimated depth."""
         rgb, zero = (batch[name].to(self.device, self.dtype) for name in ("rgb", "zero"))
         heights = batch["height"].to(self.device) if "height" in batch else None
-        depth = self.estimator(batch["rgb"].to(*placement(self.estimator))).float().to(self.device)
+        depth = estimate(self.estimator, batch["rgb"].to(*placement(self.estimator)), heights).float()
+        depth = depth.to(self.device)
         if self.network is None:
             return inverse_project(zero, depth, self.camera, heights) > 0.5
         return self.network(rgb, zero, depth, heights).zero_logits > 0

@@ -34,7 +34,7 @@ class DepthEstimator(Protocol):
     then resamples the photograph to up to that size instead of the size of the network's camera.
     """
 
-    def __call__(self, rgb: Tensor) -> Tensor:
+    def __call__(self, rgb: Tensor, /) -> Tensor:
         """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres."""
 
     def to(self, device: torch.device | str) -> Self:
@@ -44,13 +44,20 @@ class DepthEstimator(Protocol):
         """Itself, in evaluation mode."""
 
 
+def estimate(estimator: DepthEstimator, rgb: Tensor, height_m: Tensor | None = None) -> Tensor:
+    """Planar depth (B, 1, H, W) of images (B, 3, H, W), metres; only a `DepthNet` reads the heights (B,) of cameras."""
+    return estimator(rgb, height_m) if isinstance(estimator, DepthNet) else estimator(rgb)
+
+
 class DepthNet(BevModel):
     """Backbone, top-down decoder, and one inverse depth per pixel; for images of the given camera.
 
     Floor, walls and ceiling are planes; the inverse depth of a plane is affine in image coordinates, which convolutions
     extrapolate well. Ray directions are an input of the decoder, because the distance of the floor follows from the
     image row only for a known camera. With `ModelConfig.floor_depth`, the network predicts by how much a surface is in
-    front of the floor: a level camera at a known height sees nothing behind it.
+    front of the floor: a level camera at a known height sees nothing behind it. Images from another height are
+    stretched to the camera's floor, see `CameraConfig.at_height`; with `ModelConfig.own_rays` the directions are those
+    before.
     """
 
     rays: Tensor  #: (1, 2, H, W)
@@ -69,13 +76,20 @@ class DepthNet(BevModel):
             least = torch.maximum(least, rays[0, 1] / camera.height_m)
         self.register_buffer("least", least, persistent=False)
 
-    def forward(self, rgb: Tensor) -> Tensor:
-        """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres, up to `FARTHEST_M`."""
+    def forward(self, rgb: Tensor, height_m: Tensor | None = None) -> Tensor:
+        """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres, up to `FARTHEST_M`.
+
+        height_m: (B,) of the cameras, read with `ModelConfig.own_rays`; default: `camera.height_m`
+        """
         self.check(rgb=(rgb, 3))
+        own_rays = self.rays.expand(rgb.shape[0], -1, -1, -1)
+        if self.config.own_rays and height_m is not None:
+            stretch = height_m.to(self.rays.dtype) / self.camera.height_m
+            own_rays = own_rays * torch.stack([torch.ones_like(stretch), stretch], dim=1)[..., None, None]
         maps = self.backbone(rgb)
         merged: Tensor | None = None
         for features, lateral, merge in reversed(list(zip(maps, self.laterals, self.merges))):
-            rays = F.adaptive_avg_pool2d(self.rays, features.shape[-2:]).expand(rgb.shape[0], -1, -1, -1)
+            rays = F.adaptive_avg_pool2d(own_rays, features.shape[-2:])
             fine = lateral(torch.cat([features, rays.to(features.dtype)], dim=1))
             merged = merge(fine if merged is None else fine + resize(merged, fine.shape[-2:]))
         pixels = F.pixel_shuffle(self.head(merged), self.config.stem_stride)[..., : rgb.shape[-2], : rgb.shape[-1]]
@@ -160,8 +174,8 @@ class HubDepth(nn.Module):
             settings |= {"image_mean": _NONE[0], "image_std": _NONE[1]}
         return cls(network, settings.get("image_mean"), settings.get("image_std")).eval()
 
-    def forward(self, rgb: Tensor) -> Tensor:
-        """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres."""
+    def forward(self, rgb: Tensor, height_m: Tensor | None = None) -> Tensor:
+        """(B, 3, H, W) float32 in [0, 1] -> planar depth (B, 1, H, W) float32, metres; heights are not used."""
         resized = resize(rgb, (self.side_px, self.side_px))
         # without `labels`: most of these networks compute no loss and would raise
         depth = self.network(pixel_values=(resized - self.mean) / self.std).predicted_depth

@@ -1,9 +1,10 @@
 """Training, evaluation and use of depth estimators (paper, supplement, "Finetuning monocular depth estimation").
 
-The paper's objective is the mean absolute difference in metres, for our own network and for fine-tuning. That of
-logarithms weights near and far surfaces alike.
+The paper's objective is the mean absolute difference in metres, for our own network and for fine-tuning. The relative
+one weights near surfaces more.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +15,16 @@ from torch import Tensor, nn
 from zerobev.config import TrainConfig
 from zerobev.data.samples import Augment, Sample, as_float
 from zerobev.data.view_set import ViewSampler, ViewSet
-from zerobev.models.depth import DepthEstimator
+from zerobev.models.depth import DepthEstimator, estimate
 from zerobev.training.history import History
 from zerobev.training.loader import Batch
 from zerobev.training.losses import Losses
 from zerobev.training.train import Objective, train
 
 _BATCH = 32  # images per forward pass
+_NEAREST_M = 0.5  # nearer surfaces have the weight of this distance in the relative objective
+#: Image (H, W, 3) uint8, depth (H, W) float32, metres, and height of the camera, metres, if it differs between views.
+_Pair = tuple[np.ndarray, np.ndarray, float | None]
 
 
 class DepthSamples:
@@ -35,12 +39,15 @@ class DepthSamples:
         self._order = ViewSampler(len(views), seed)
 
     def batch(self, step: int, rank: int = 0, world_size: int = 1) -> dict[str, Tensor]:
-        """`rgb` (B, 3, H, W) uint8 and `depth` (B, 1, H, W) float32, metres; see `training.loader.Source`."""
+        """`rgb` (B, 3, H, W) uint8 and `depth` (B, 1, H, W) float32, metres; see `training.loader.Source`.
+
+        If views are from different heights, also `height` (B,) float32, metres.
+        """
         first = step * self._batch
         return _collated([self.sample(i) for i in range(first + rank, first + self._batch, world_size)])
 
-    def sample(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Image (H, W, 3) uint8 and depth (H, W) float32, metres."""
+    def sample(self, index: int) -> _Pair:
+        """Image, depth and height."""
         scene, view = self._views.locate(self._order[index])
         rng = np.random.default_rng([self._seed, 1, index])
         rgb, depth = view.rgb, view.depth
@@ -49,21 +56,24 @@ class DepthSamples:
             sample: Sample = {"rgb": np.moveaxis(rgb, -1, 0), "depth": depth[None]}
             sample = self._augment(sample, view, self._views.shards[scene].charts, rng)
             rgb, depth = np.moveaxis(np.asarray(sample["rgb"]), 0, -1), np.asarray(sample["depth"])[0]
-        return (rgb[:, ::-1], depth[:, ::-1]) if mirrored else (rgb, depth)
+        return (rgb[:, ::-1], depth[:, ::-1], view.height_m) if mirrored else (rgb, depth, view.height_m)
 
 
 def depth_objective(model: nn.Module, batch: Batch) -> Losses:
     """Mean absolute difference over the pixels with known depth (above 0), metres."""
-    valid = batch["depth"] > 0
-    error = (model(batch["rgb"]).float() - batch["depth"]).abs()
-    loss = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
-    return Losses(loss, loss)
+    return _mean_error(model, batch, torch.ones_like)
 
 
-def log_depth_objective(model: nn.Module, batch: Batch) -> Losses:
-    """Mean absolute difference of the logarithms of depth, over the pixels with known depth (not in the paper)."""
+def relative_depth_objective(model: nn.Module, batch: Batch) -> Losses:
+    """Mean relative difference over the pixels with known depth (not in the paper); at most twice that in metres."""
+    return _mean_error(model, batch, lambda depth: 1 / depth.clamp(min=_NEAREST_M))
+
+
+def _mean_error(model: nn.Module, batch: Batch, weight: Callable[[Tensor], Tensor]) -> Losses:
+    """Mean of the absolute differences times a weight that depends on true depth."""
     valid = batch["depth"] > 0
-    error = (model(batch["rgb"]).float().log() - torch.where(valid, batch["depth"], 1).log()).abs()
+    heights = (batch["height"],) if "height" in batch else ()
+    error = (model(batch["rgb"], *heights).float() - batch["depth"]).abs() * weight(batch["depth"])
     loss = torch.where(valid, error, 0).sum() / valid.sum().clamp(min=1)
     return Losses(loss, loss)
 
@@ -84,7 +94,7 @@ def train_depth(
     """Train a `DepthEstimator` in place, to the weights with the best validation score (see `training.train`).
 
     augment: changes each training sample at random
-    objective: `depth_objective` or `log_depth_objective`; the score is its mean over `validation`
+    objective: `depth_objective` or `relative_depth_objective`; the score is its mean over `validation`
     validation: all its views, unmirrored
     """
     held_out = [_views_batch(validation, first) for first in range(0, len(validation), _BATCH)]
@@ -120,10 +130,10 @@ def predict_depth(estimator: DepthEstimator, views: ViewSet, device: torch.devic
     The estimator is moved to `device` and put into evaluation mode; it computes in float32.
     """
     estimator = estimator.to(device).eval()
-    maps = [
-        estimator(_views_batch(views, first)["rgb"].to(device))[:, 0].half().cpu().numpy()
-        for first in range(0, len(views), _BATCH)
-    ]
+    maps = []
+    for first in range(0, len(views), _BATCH):
+        batch = {name: value.to(device) for name, value in _views_batch(views, first).items()}
+        maps.append(estimate(estimator, batch["rgb"], batch.get("height"))[:, 0].half().cpu().numpy())
     ends = np.cumsum([len(shard) for shard in views.shards])
     return np.split(np.concatenate(maps), ends[:-1])
 
@@ -132,14 +142,15 @@ def _views_batch(views: ViewSet, first: int) -> dict[str, Tensor]:
     return as_float(_collated([_pair(views, i) for i in range(first, min(first + _BATCH, len(views)))]))
 
 
-def _pair(views: ViewSet, index: int) -> tuple[np.ndarray, np.ndarray]:
+def _pair(views: ViewSet, index: int) -> _Pair:
     view = views.locate(index)[1]
-    return view.rgb, view.depth
+    return view.rgb, view.depth, view.height_m
 
 
-def _collated(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Tensor]:
-    rgb, depth = (np.stack(images) for images in zip(*pairs))
-    return {
+def _collated(pairs: list[_Pair]) -> dict[str, Tensor]:
+    rgb, depth = np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
+    heights = [height for _, _, height in pairs if height is not None]
+    return ({"height": torch.tensor(heights, dtype=torch.float32)} if heights else {}) | {
         "rgb": torch.from_numpy(np.ascontiguousarray(np.moveaxis(rgb, -1, 1))),
         "depth": torch.from_numpy(depth[:, None].astype(np.float32)),
     }

@@ -1,7 +1,6 @@
 """Depth in metres: training pairs, errors in closed form, our network, and models of the transformers library."""
 
 import json
-import math
 import re
 from dataclasses import fields, replace
 from pathlib import Path
@@ -45,8 +44,8 @@ from zerobev.training.depth import (
     DepthSamples,
     depth_errors,
     depth_objective,
-    log_depth_objective,
     predict_depth,
+    relative_depth_objective,
     train_depth,
 )
 
@@ -136,12 +135,27 @@ def test_the_objective_is_the_mean_absolute_difference_over_known_depth():
     assert float(nothing.total.detach()) == 0
 
 
-def test_the_objective_of_logarithms_is_equal_for_equal_ratios():
-    predicted = torch.tensor([0.5, 8.0, 9.0], requires_grad=True)
-    losses = log_depth_objective(lambda rgb: predicted, {"rgb": torch.zeros(1), "depth": torch.tensor([1.0, 4.0, 0.0])})
+def test_the_relative_objective_divides_by_true_depth():
+    predicted = torch.tensor([3.0, 1.0, 9.0], requires_grad=True)
+    batch = {"rgb": torch.zeros(1), "depth": torch.tensor([4.0, 0.2, 0.0])}
+    losses = relative_depth_objective(lambda rgb: predicted, batch)
     losses.total.backward()
-    assert float(losses.total.detach()) == pytest.approx(math.log(2))
-    np.testing.assert_allclose(predicted.grad, [-1.0, 1 / 16, 0.0], atol=1e-7)
+    assert float(losses.total.detach()) == pytest.approx((1 / 4 + 0.8 / 0.5) / 2)  # as if it were half a metre away
+    np.testing.assert_allclose(predicted.grad, [-1 / 8, 1.0, 0.0])
+
+
+def test_own_rays_tell_heights_apart():
+    """With own rays the height changes the depth; without, and at the camera's own height, it does not."""
+    rgb = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    scale = SCALES["smoke"]
+    for own_rays in (False, True):
+        torch.manual_seed(0)
+        network = DepthNet(scale.camera, replace(scale.model, own_rays=own_rays)).eval()
+        with torch.inference_mode():
+            plain, same, other = (network(rgb, h) for h in (None, torch.full((2,), 0.88), torch.tensor([0.88, 1.6])))
+        torch.testing.assert_close(plain, same)
+        torch.testing.assert_close(plain[0], other[0])
+        assert torch.allclose(plain[1], other[1]) != own_rays
 
 
 def test_errors_in_closed_form():
