@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from matplotlib.figure import Figure
 
 import zerobev
 from zerobev.common.errors import InputError
@@ -250,7 +251,7 @@ def test_a_picture_shows_each_layer_and_what_was_seen():
     home.add(view(values, ("floor", "chair")), Pose2D(4, 4, 0))
     colours = np.unique(home.image().reshape(-1, 3), axis=0, return_counts=True)
     assert sorted(colours[1].tolist()) == [1, 4, 11, 48]
-    axes = home.show()
+    axes = home.show(Figure().subplots())
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["floor", "chair"]
     assert axes.get_images()[0].get_extent() == [0, 8, 0, 8]
 
