@@ -1,7 +1,7 @@
 """Zero-BEV: zero-shot projection of any first-person modality to a bird's-eye-view map.
 
 `zerobev.load().project(rgb, modality)` covers most uses, see `zerobev.inference`; `zerobev.HomeMap` fuses the maps of a
-walk.
+walk; `zerobev.playground()` shows the map of a mask that is painted in JupyterLab.
 """
 
 import os
@@ -14,6 +14,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from zerobev.inference import BevArrows, BevMap, Boxes, Camera, Flow, Labels, Masks, Probabilities, Projector, load
+    from zerobev.interactive import playground
     from zerobev.mapping import HomeMap, Pose2D
 
 __version__ = "0.2.0.dev0"
@@ -31,12 +32,15 @@ __all__ = [
     "Probabilities",
     "Projector",
     "load",
+    "playground",
 ]
+
+# the room of each name that is not of `inference`
+_ROOMS = {"HomeMap": "mapping", "Pose2D": "mapping", "playground": "interactive"}
 
 
 def __getattr__(name: str) -> Any:
     # imported on first use: most commands need no network
     if name in __all__:
-        room = "mapping" if name in ("HomeMap", "Pose2D") else "inference"
-        return getattr(import_module(f"zerobev.{room}"), name)
+        return getattr(import_module(f"zerobev.{_ROOMS.get(name, 'inference')}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -95,6 +95,8 @@ def test_the_wheel_holds_the_package_its_weights_and_one_version(wheel):
         names = archive.namelist()
     weights = {path.name for path in (ROOT / "zerobev/inference/shipped").glob("*.safetensors")}
     assert weights and {Path(name).name for name in names if name.endswith(".safetensors")} == weights
+    files = {path.relative_to(ROOT) for path in (ROOT / "zerobev").rglob("*") if "__pycache__" not in path.parts}
+    assert {str(file) for file in files if file.suffix} <= set(names)
     assert "zerobev/py.typed" in names
     assert {name.partition("/")[0] for name in names} == {"zerobev", f"zerobev-{zerobev.__version__}.dist-info"}
     assert metadata(wheel)["Version"] == zerobev.__version__

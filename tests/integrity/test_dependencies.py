@@ -29,7 +29,7 @@ GROUPS = tuple(INCLUDED)
 GROUP_OF = {
     "inference.export": "export",
     **dict.fromkeys(["common.parallel", "scenes", "rendering", "data", "evaluation"], "scenes"),
-    **dict.fromkeys(["common.locks", "training", "experiments", "benchmarks", "report"], "workbook"),
+    **dict.fromkeys(["common.locks", "interactive", "training", "experiments", "benchmarks", "report"], "workbook"),
 }
 #: Commands and plug-ins without an import.
 TOOLS = {"ipykernel", "jupyterlab", "nbval", "ruff", "mypy", "coverage", "import-linter", "codespell", "setuptools"}
@@ -50,13 +50,20 @@ def declared(group: str) -> set[str]:
 
 
 def imported(source: str) -> set[str]:
-    """Full names of all modules that `source` imports, also in functions; `from a import b` gives a and a.b."""
+    """Full names of all modules that `source` imports, also in functions; `from a import b` gives a and a.b.
+
+    Without imports for type checkers, which are not loaded.
+    """
     names: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    waiting: list[ast.AST] = [ast.parse(source)]
+    while waiting:
+        node = waiting.pop()
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        elif not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+            waiting += ast.iter_child_nodes(node)
     return names
 
 

@@ -143,6 +143,7 @@ def execute(notebook: Path, executed: Path, logs: Path, parameters: dict[str, st
                     stderr_file=streams,
                     cwd=zerobev_home(),
                     coalesce_streams=True,
+                    store_widget_state=False,  # its keys are random, and pages with it load scripts from the internet
                 )
         except PapermillExecutionError as error:
             streams.write(str(error))
