@@ -15,7 +15,8 @@ from zerobev.common.errors import InputError
 from zerobev.common.storage import replacing
 from zerobev.config import CameraConfig
 
-_FLOOR, _OUTSIDE = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
+#: Colours of cells in the field of view in which no map is white, and of cells outside of it.
+NOTHING, OUTSIDE = "#ffffff", "#9aa0a6"
 _MAX_LEGEND = 12
 _COLORS = [color for name in ("tab10", "Set2", "Set1") for color in matplotlib.color_sequences[name]]
 
@@ -70,11 +71,11 @@ class BevMap:
 
     def image(self) -> np.ndarray:
         """(M, M, 3) float64: each map in another colour, larger maps below smaller ones."""
-        image = np.where(self.fov[..., None], _FLOOR, _OUTSIDE)
+        image = np.where(self.fov[..., None], to_rgb(NOTHING), to_rgb(OUTSIDE))
         for k in np.argsort(-self.maps.sum(axis=(1, 2)), kind="stable").tolist():
             opacity = (self.values[k] * self.fov * (self.values[k] > 0.1))[..., None]
             image = (1 - opacity) * image + opacity * np.array(color_of(k))
-        return image
+        return image.clip(0, 1)  # blending rounds
 
     def show(self, axes: Axes | None = None) -> Axes:
         """Draw the maps with metres on both axes, and a legend of the maps that are not empty.
@@ -92,7 +93,7 @@ class BevMap:
         shown = np.flatnonzero(found).tolist()
         if 0 < len(shown) <= _MAX_LEGEND:
             patches = [Patch(color=color_of(k), label=self._title(k)) for k in shown]
-            axes.legend(handles=patches, fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
+            axes.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
         return axes
 
     def save(self, path: str | Path) -> None:
@@ -150,7 +151,7 @@ class BevArrows:
     def show(self, axes: Axes | None = None, color: str = "tab:red") -> Axes:
         """Draw the arrows over the field of view, with metres on both axes."""
         axes = axes or plt.gca()
-        field = np.where(self.starts.fov[..., None], _FLOOR, _OUTSIDE)
+        field = np.where(self.starts.fov[..., None], to_rgb(NOTHING), to_rgb(OUTSIDE))
         axes.imshow(field, extent=self.extent, interpolation="nearest")
         start, vector = self.start_m, self.end_m - self.start_m
         axes.quiver(*start.T, *vector.T, color=color, angles="xy", scale_units="xy", scale=1, width=0.006)

@@ -13,12 +13,13 @@ from typing import Self
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 from scipy.special import expit, logit
 
 from zerobev.common.errors import InputError, first_line
 from zerobev.common.storage import replacing
-from zerobev.inference.bev_map import BevMap, color_of
+from zerobev.inference.bev_map import NOTHING, OUTSIDE, BevMap, color_of
 from zerobev.mapping.grid import Grid, Window
 from zerobev.mapping.nav2 import FREE, OCCUPIED, UNKNOWN, write_nav2
 from zerobev.mapping.pose import Pose2D
@@ -31,7 +32,6 @@ LOWEST, HIGHEST = 0.05, 0.9
 #: Largest absolute log-odds of a cell, so that a few views can correct many wrong ones.
 LIMIT = 6.0
 
-_VIEWED, _OUTSIDE = (0.93, 0.93, 0.93), (1.0, 1.0, 1.0)
 _MAX_LEGEND = 12
 # a full disk is not among them: it ends every command in the same way
 _CANNOT_WRITE = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
@@ -154,8 +154,8 @@ class HomeMap:
         return cropped
 
     def image(self) -> np.ndarray:
-        """(R, C, 3) float64: a colour per layer, smaller ones above larger ones; white where nothing was in view."""
-        image = np.where(self.viewed[..., None], _VIEWED, _OUTSIDE)
+        """(R, C, 3) float64: a colour per layer, smaller ones above larger ones; grey where nothing was in view."""
+        image = np.where(self.viewed[..., None], to_rgb(NOTHING), to_rgb(OUTSIDE))
         maps = list(self.maps.values())
         for k in sorted(range(len(maps)), key=lambda k: -maps[k].sum()):
             image = np.where(maps[k][..., None], color_of(k), image)
@@ -170,7 +170,7 @@ class HomeMap:
         found = [(k, name) for k, (name, cells) in enumerate(self.maps.items()) if cells.any()]
         if 0 < len(found) <= _MAX_LEGEND:
             patches = [Patch(color=color_of(k), label=name) for k, name in found]
-            axes.legend(handles=patches, fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
+            axes.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
         return axes
 
     def save(self, path: str | Path) -> None:

@@ -17,6 +17,7 @@ from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
 from zerobev.experiments.run_records import RunRecord
 from zerobev.geometry.cameras import Pose
+from zerobev.inference.bev_map import NOTHING, OUTSIDE
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.report.claims import Verdict, limit_of
 from zerobev.report.names import named
@@ -26,8 +27,7 @@ from zerobev.scenes.scene import Scene
 
 #: One colour per class, in the order of `LABELS`; the hues of Okabe and Ito, which colour-blind readers can tell apart.
 COLORS = ("#3b3b3b", "#e3cf8f", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#56b4e9", "#e69f00")
-#: Cells of no class, and cells outside the field of view.
-NOTHING, OUTSIDE = "#ffffff", "#9aa0a6"
+#: Our numbers, and the paper's.
 OURS, PAPER = COLORS[4], COLORS[2]
 #: (10, 3) uint8: classes, outside, nothing (`NO_LABEL`, the last).
 _PALETTE = (255 * to_rgba_array([*COLORS, OUTSIDE, NOTHING])[:, :3]).round().astype(np.uint8)
