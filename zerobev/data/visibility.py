@@ -38,9 +38,9 @@ def visibility(scene: Scene, poses: Iterable[Pose], camera: CameraConfig) -> np.
     return np.stack(found)
 
 
-def shard_visibility(scene_folder: Path, shard: Shard, camera: CameraConfig) -> np.ndarray:
-    """`visibility` at the poses of a shard's views. Raises `InputError` for a scene that cannot be read."""
-    poses = [Pose(*shard.view(number).pose) for number in range(len(shard))]
+def shard_visibility(scene_folder: Path, shard: Shard, views: int, camera: CameraConfig) -> np.ndarray:
+    """`visibility` at the poses of a shard's first views. Raises `InputError` for a scene that cannot be read."""
+    poses = [Pose(*shard.view(number).pose) for number in range(min(views, len(shard)))]
     return visibility(read_scene(scene_folder), poses, camera)
 
 

@@ -30,6 +30,7 @@ from zerobev.data.sensor_depth import completed, sensor_depth
 from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
+from zerobev.evaluation.other_cameras import POSES, cameras_table, evaluate_cameras
 from zerobev.geometry.projection import inverse_project
 from zerobev.inference.pretrained import GEOMETRIC
 from zerobev.inference.projector import Projector, load
@@ -265,11 +266,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=int, default=40, help="per scene (default: 40)")
     parser.add_argument("--seed", type=int, default=0, help="of the poses")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all results there")
+    parser.add_argument(
+        "--cameras", action="store_true", help=f"other cameras at {POSES} poses per scene, see evaluation.other_cameras"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate and print the tables; exit code 1 if a scene was skipped."""
     torch.manual_seed(0)
+    if options.cameras:
+        print(
+            cameras_table(evaluate_cameras(list_scenes(options.scenes), options.seed)).round(1).to_string(index=False)
+        )
+        return
     results = evaluate_homes(list_scenes(options.scenes), options.views, options.seed, partial(print, flush=True))
     print(f"\n{len(results.homes)} homes, {options.views} views each; IoU in percent [90 % interval over homes]")
     print(results_table(results.counts).to_string())

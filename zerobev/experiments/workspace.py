@@ -149,12 +149,15 @@ class Workspace:
         return ViewSet([Shard(shard_path(f, out), self.scale.camera, self.scale.texture) for f in folders])
 
     def visibility(self, split: Split) -> list[np.ndarray]:
-        """`data.visibility` of the views of a split: (V, M, M) uint8 per scene; missing arrays are made now."""
-        shards = self.views(split).shards
-        folder = self.views_folder / f"{split}-visibility"
+        """`data.visibility` of the views of a split that are evaluated, see `Scale.test_views`.
+
+        (V, M, M) uint8 per scene; missing arrays are made now.
+        """
+        shards, views = self.views(split).shards, self.scale.test_views or self.scale.scenes.views
+        folder = self.views_folder / f"{split}-visibility-{views}"
         paths = {shard.path.stem: folder / f"{shard.path.stem}.npy" for shard in shards}
         jobs = [
-            joblib.delayed(_save_visibility)(scene, shard, self.scale.camera, paths[shard.path.stem])
+            joblib.delayed(_save_visibility)(scene, shard, views, self.scale.camera, paths[shard.path.stem])
             for scene, shard in zip(self.split.of(split), shards)
             if not paths[shard.path.stem].exists()
         ]
@@ -179,7 +182,7 @@ class Workspace:
         return TextureBank.load(path)
 
 
-def _save_visibility(scene_folder: Path, shard: Shard, camera: CameraConfig, path: Path) -> None:
-    found = shard_visibility(scene_folder, shard, camera)
+def _save_visibility(scene_folder: Path, shard: Shard, views: int, camera: CameraConfig, path: Path) -> None:
+    found = shard_visibility(scene_folder, shard, views, camera)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.save(file, found)
