@@ -117,7 +117,7 @@ def contains_no_machine_paths(notebook: NotebookNode) -> None:
 
 def cells_are_short(notebook: NotebookNode) -> None:
     lines = [len(cell.source.splitlines()) for cell in code_cells(notebook)]
-    assert statistics.median(lines) <= 6 and max(lines) <= 28
+    assert statistics.median(lines) <= 6 and max(lines) <= 25
 
 
 def prose_precedes_every_code_cell(notebook: NotebookNode) -> None:
