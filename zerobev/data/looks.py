@@ -15,7 +15,7 @@ from scipy import ndimage
 from zerobev.config import CameraConfig
 from zerobev.data.textures import TextureBank
 from zerobev.data.views import View
-from zerobev.geometry.cameras import fpv_rays
+from zerobev.geometry.cameras import column_slopes
 
 # probabilities of each change in a sample with a new look
 _RECOLORED, _PATTERNED, _RELIT, _BLURRED, _COMPRESSED = 0.6, 0.6, 0.6, 0.4, 0.4
@@ -58,17 +58,12 @@ def _patterns(view: View, bank: TextureBank, charts: int, rng: np.random.Generat
 
 def _illumination(depth: np.ndarray, camera: CameraConfig, rng: np.random.Generator) -> np.ndarray:
     """(H, W) float32: light that falls off with the distance from a lamp at a random place."""
-    slopes = _slopes(camera)
+    slopes = column_slopes(camera.fpv_px, camera.focal_px).astype(np.float32)
     right, down, forward = rng.uniform((-3, -1.5, -0.5), (3, 0.8, 5)).astype(np.float32)
     squared = (slopes * depth - right) ** 2 + (slopes[:, None] * depth - down) ** 2 + (depth - forward) ** 2
     light = 1 / (squared + np.float32(rng.uniform(0.5, 4)))
     ambient = np.float32(rng.uniform(0.1, 0.8))
     return ambient + (1 - ambient) / light.mean() * light
-
-
-@cache
-def _slopes(camera: CameraConfig) -> np.ndarray:
-    return fpv_rays(camera)[0, :, 0].astype(np.float32)
 
 
 @cache

@@ -7,6 +7,7 @@ only by a fixed rotation and the camera's height.
 
 import math
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
 
@@ -135,9 +136,17 @@ def fpv_rays(camera: CameraConfig) -> np.ndarray:
 
     The ray parameter of a hit is therefore its planar depth.
     """
-    u = (np.arange(camera.fpv_px) + 0.5 - camera.fpv_px / 2) / camera.focal_px
-    x, y = np.meshgrid(u, u)
+    slopes = column_slopes(camera.fpv_px, camera.focal_px)
+    x, y = np.meshgrid(slopes, slopes)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+@cache
+def column_slopes(fpv_px: int, focal_px: float) -> np.ndarray:
+    """(H,) float64: at depth 1, the offset of each image column to the right, and of each row downwards."""
+    slopes = (np.arange(fpv_px) + 0.5 - fpv_px / 2) / focal_px
+    slopes.flags.writeable = False
+    return slopes
 
 
 def bev_cell_centres(camera: CameraConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -3,20 +3,12 @@
 Written in torch, since the residual model applies it to batches inside the network.
 """
 
-from functools import cache
-
 import numpy as np
 import torch
 from scipy.spatial import ConvexHull
 
 from zerobev.config import CameraConfig
-from zerobev.geometry.cameras import fpv_rays
-
-
-@cache
-def _slopes(camera: CameraConfig) -> np.ndarray:
-    """(H,) float64: at depth 1, the offset of each column to the right and of each row downwards."""
-    return fpv_rays(camera)[0, :, 0]
+from zerobev.geometry.cameras import column_slopes
 
 
 def map_coordinates(depth: torch.Tensor, camera: CameraConfig) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -24,7 +16,7 @@ def map_coordinates(depth: torch.Tensor, camera: CameraConfig) -> tuple[torch.Te
 
     depth: (..., H, W) planar depth, metres, of square images
     """
-    slopes = torch.as_tensor(_slopes(camera), dtype=depth.dtype, device=depth.device)
+    slopes = torch.tensor(column_slopes(camera.fpv_px, camera.focal_px), dtype=depth.dtype, device=depth.device)
     return slopes * depth, depth, camera.height_m - slopes[:, None] * depth
 
 

@@ -1,5 +1,6 @@
 """P^-1 against a closed form and a naive voxel grid; the field of view against scikit-image's convex hull."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -194,3 +195,15 @@ def test_field_of_view_on_an_infinite_floor_is_a_trapezium():
     clear = np.abs(borders).min(axis=0) > 0.2
     assert np.array_equal(mask[clear], expected[clear])
     assert clear.mean() > 0.75
+
+
+def test_memory_does_not_grow_with_the_number_of_cameras():
+    """Each view of a training has a camera of its own."""
+    depth = np.ones((CAMERA.fpv_px, CAMERA.fpv_px), np.float32)
+    fov_mask(depth, CAMERA)
+    tracemalloc.start()
+    for height in np.linspace(0.3, 1.8, 300):
+        fov_mask(depth, CAMERA.at_height(float(height)))
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 300 * depth.nbytes / 8
