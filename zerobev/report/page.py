@@ -70,7 +70,7 @@ def write_summary(workspace: Workspace) -> Path:
         counted={name: of_paper[name] for name in VERDICTS if of_paper[name]},
         verdicts=sorted(verdicts, key=lambda verdict: verdict.table),
         scoreboard=_scoreboard(verdicts, folder),
-        notebooks={path.stem[:2]: _link(path, folder) for path in sorted(NOTEBOOKS.glob("*.ipynb"))},
+        notebooks={path.stem.partition("_")[0]: _link(path, folder) for path in sorted(NOTEBOOKS.glob("*.ipynb"))},
         ratios=ratios,
         tables=[_table(number, frame, records, folder) for number, frame in tables.items()],
         gallery=_gallery(workspace, records),

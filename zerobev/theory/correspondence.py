@@ -4,7 +4,7 @@ An image column and its ray lie in one vertical plane. Position p of the ray is 
 planar depth. The depth of a pixel alone therefore gives its position.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -88,3 +88,8 @@ class Columns(NamedTuple):
 
     features: Tensor  #: (N, R, F) float32, input of the keys
     gamma: Tensor  #: (N, P, R) bool
+
+    @classmethod
+    def of(cls, depth: Tensor, camera: CameraConfig) -> Self:
+        """The columns of depth images (B, H, W), metres, with `point_features` and `correspondence`."""
+        return cls(point_features(depth, camera), correspondence(depth, camera))

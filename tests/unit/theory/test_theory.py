@@ -23,7 +23,6 @@ from zerobev.theory.attention import CrossAttention, divergence, total_variation
 from zerobev.theory.correspondence import (
     Columns,
     correspondence,
-    point_features,
     pool,
     positions,
     uncertain_correspondence,
@@ -115,7 +114,7 @@ def test_certain_depth_is_the_indicator():
 
 def learned(rng: np.random.Generator, value: tuple[int, int] | None = None) -> tuple[CrossAttention, Columns]:
     depth = steps_of_depth(rng, 24)
-    seen = Columns(point_features(depth, CAMERA), correspondence(depth, CAMERA))
+    seen = Columns.of(depth, CAMERA)
     return CrossAttention(CAMERA.bev_px, seen.features.shape[-1], rng, value=value), seen
 
 
