@@ -1,5 +1,7 @@
 """Results of a projection: maps, and arrows between maps, in metres."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +15,10 @@ from matplotlib.patches import Patch
 
 from zerobev.common.errors import InputError
 from zerobev.common.storage import replacing
-from zerobev.config import CameraConfig
+from zerobev.config import LABELS, CameraConfig
 
+#: One colour per class, in the order of `LABELS`; the hues of Okabe and Ito, which colour-blind readers can tell apart.
+CLASS_COLORS = ("#3b3b3b", "#e3cf8f", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#56b4e9", "#e69f00")
 #: Colours of cells in the field of view in which no map is white, and of cells outside of it.
 NOTHING, OUTSIDE = "#ffffff", "#9aa0a6"
 _MAX_LEGEND = 12
@@ -71,29 +75,29 @@ class BevMap:
 
     def image(self) -> np.ndarray:
         """(M, M, 3) float64: each map in another colour, larger maps below smaller ones."""
-        image = np.where(self.fov[..., None], to_rgb(NOTHING), to_rgb(OUTSIDE))
+        colors, image = colors_of(self.labels), np.where(self.fov[..., None], to_rgb(NOTHING), to_rgb(OUTSIDE))
         for k in np.argsort(-self.maps.sum(axis=(1, 2)), kind="stable").tolist():
             opacity = (self.values[k] * self.fov * (self.values[k] > 0.1))[..., None]
-            image = (1 - opacity) * image + opacity * np.array(color_of(k))
+            image = (1 - opacity) * image + opacity * np.array(colors[k])
         return image.clip(0, 1)  # blending rounds
 
     def show(self, axes: Axes | None = None) -> Axes:
         """Draw the maps with metres on both axes, and a legend of the maps that are not empty.
 
-        All detections are shown: a cross marks the centre of a detection with an empty map.
+        Classes have the colours of all figures, see `colors_of`; the legend also names cells with nothing and cells
+        outside the view. All detections are shown: a cross marks the centre of a detection with an empty map.
         """
         axes = axes or plt.gca()
         axes.imshow(self.image(), extent=self.extent, interpolation="nearest")
         axes.set(xlabel="right [m]", ylabel="forward [m]")
-        found = self.maps.any(axis=(1, 2))
+        maps, colors = self.maps, colors_of(self.labels)
+        found = maps.any(axis=(1, 2))
         if self.scores is not None:
             for k in np.flatnonzero(~found).tolist():
-                axes.plot(*self.centres_m[k], "x", color=color_of(k))
+                axes.plot(*self.centres_m[k], "x", color=colors[k])
             found |= np.isfinite(self.centres_m).all(axis=1)
-        shown = np.flatnonzero(found).tolist()
-        if 0 < len(shown) <= _MAX_LEGEND:
-            patches = [Patch(color=color_of(k), label=self._title(k)) for k in shown]
-            axes.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
+        entries = [(self._title(k), colors[k]) for k in np.flatnonzero(found).tolist()]
+        add_legend_of_maps(axes, entries, bool((self.fov & ~maps.any(axis=0)).any()), not self.fov.all())
         return axes
 
     def save(self, path: str | Path) -> None:
@@ -159,6 +163,22 @@ class BevArrows:
         return axes
 
 
-def color_of(k: int) -> tuple[float, float, float]:
-    """Colour of map number k; colours repeat after some dozens."""
-    return to_rgb(_COLORS[k % len(_COLORS)])
+def colors_of(names: Sequence[str]) -> list[tuple[float, float, float]]:
+    """A colour per map: its class's for the first map of a class, else the next one of a sequence of some dozens."""
+    others, of_class = itertools.cycle(_COLORS), dict(zip(LABELS, CLASS_COLORS))
+    return [to_rgb(of_class.pop(name, "") or next(others)) for name in names]
+
+
+def add_legend_of_maps(
+    axes: Axes, maps: Sequence[tuple[str, tuple[float, float, float]]], nothing: bool, outside: bool
+) -> None:
+    """Add a legend beside the axes.
+
+    maps: name and colour of each; more than a dozen are left out
+    nothing, outside: whether there are cells without a map, and outside the field of view
+    """
+    entries = list(maps) if len(maps) <= _MAX_LEGEND else []
+    entries += [("nothing", to_rgb(NOTHING))] if nothing else []
+    entries += [("outside the view", to_rgb(OUTSIDE))] if outside else []
+    patches = [Patch(facecolor=color, edgecolor="#777777", linewidth=0.5, label=name) for name, color in entries]
+    axes.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)

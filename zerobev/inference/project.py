@@ -14,7 +14,7 @@ import numpy as np
 from zerobev.common.errors import InputError, first_line
 from zerobev.common.storage import replacing
 from zerobev.geometry.cameras import Camera
-from zerobev.inference.bev_map import BevMap, color_of
+from zerobev.inference.bev_map import BevMap, colors_of
 from zerobev.inference.boxes import Boxes
 from zerobev.inference.detector import HubDetector
 from zerobev.inference.labels import IGNORE, Labels
@@ -31,8 +31,8 @@ _OPACITY = 0.5
 def figure_of(rgb: np.ndarray, images: BinaryImages, bev: BevMap) -> plt.Figure:
     """The photograph with its masks on top, and the map."""
     shown = rgb / 255
-    for k, mask in enumerate(images.images):
-        shown = np.where(mask[..., None], (1 - _OPACITY) * shown + _OPACITY * np.array(color_of(k)), shown)
+    for mask, color in zip(images.images, colors_of(bev.labels)):
+        shown = np.where(mask[..., None], (1 - _OPACITY) * shown + _OPACITY * np.array(color), shown)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4))
     left.imshow(shown)
     left.set_axis_off()

@@ -140,7 +140,7 @@ function render({ model, el }) {
     text.textContent = model.get("text");
   }
 
-  const drawn = { "change:bits": drawMask, "change:map": drawMap, "change:text": drawText };
+  const drawn = { "change:bits": drawMask, "change:color": drawMask, "change:map": drawMap, "change:text": drawText };
   for (const [event, draw] of Object.entries(drawn)) {
     draw();
     model.on(event, draw);

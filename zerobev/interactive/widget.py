@@ -18,7 +18,7 @@ from PIL import Image
 from zerobev.common.errors import InputError
 from zerobev.inference import BevMap, Camera, ImageView, Masks, Projector, load, read_labels
 from zerobev.inference.arrays import as_array, checked_image
-from zerobev.inference.bev_map import color_of
+from zerobev.inference.bev_map import colors_of
 from zerobev.inference.modality import Names, chosen_names
 from zerobev.inference.projector import LEVEL
 from zerobev.inference.reader import is_source
@@ -64,7 +64,6 @@ class Playground(anywidget.AnyWidget):
             photograph=file.getvalue(),
             size=(width, height),
             has_instances=bool(names),
-            color=tuple(round(255 * value) for value in color_of(0)),
             bits=bytes(-(-height * width // 8)),
             extent=view.projector.camera.extent,
         )
@@ -126,6 +125,7 @@ class Playground(anywidget.AnyWidget):
         area_m2 = self.bev.maps.sum() * self.bev.cell_m**2
         right_m, forward_m = self.bev.centres_m[0]
         with self.hold_sync():  # one message
+            self.color = tuple(round(255 * value) for value in colors_of([name])[0])
             self.map = np.round(rgba * 255).astype(np.uint8).tobytes()
             self.text = "nothing on the map"
             if np.isfinite(forward_m):

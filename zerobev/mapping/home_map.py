@@ -14,12 +14,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.patches import Patch
 from scipy.special import expit, logit
 
 from zerobev.common.errors import InputError, first_line
 from zerobev.common.storage import replacing
-from zerobev.inference.bev_map import NOTHING, OUTSIDE, BevMap, color_of
+from zerobev.inference.bev_map import NOTHING, OUTSIDE, BevMap, add_legend_of_maps, colors_of
 from zerobev.mapping.grid import Grid, Window
 from zerobev.mapping.nav2 import FREE, OCCUPIED, UNKNOWN, write_nav2
 from zerobev.mapping.pose import Pose2D
@@ -32,7 +31,6 @@ LOWEST, HIGHEST = 0.05, 0.9
 #: Largest absolute log-odds of a cell, so that a few views can correct many wrong ones.
 LIMIT = 6.0
 
-_MAX_LEGEND = 12
 # a full disk is not among them: it ends every command in the same way
 _CANNOT_WRITE = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
 
@@ -156,9 +154,9 @@ class HomeMap:
     def image(self) -> np.ndarray:
         """(R, C, 3) float64: a colour per layer, smaller ones above larger ones; grey where nothing was in view."""
         image = np.where(self.viewed[..., None], to_rgb(NOTHING), to_rgb(OUTSIDE))
-        maps = list(self.maps.values())
+        maps, colors = list(self.maps.values()), colors_of(self.layers)
         for k in sorted(range(len(maps)), key=lambda k: -maps[k].sum()):
-            image = np.where(maps[k][..., None], color_of(k), image)
+            image = np.where(maps[k][..., None], colors[k], image)
         return image
 
     def show(self, axes: Axes | None = None) -> Axes:
@@ -167,10 +165,10 @@ class HomeMap:
         x0, y0, x1, y1 = self.grid.extent
         axes.imshow(self.image(), extent=(x0, x1, y0, y1), interpolation="nearest")
         axes.set(xlabel="x [m]", ylabel="y [m]")
-        found = [(k, name) for k, (name, cells) in enumerate(self.maps.items()) if cells.any()]
-        if 0 < len(found) <= _MAX_LEGEND:
-            patches = [Patch(color=color_of(k), label=name) for k, name in found]
-            axes.legend(handles=patches, fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0)
+        maps = self.maps
+        found = [(name, color) for name, color in zip(maps, colors_of(self.layers)) if maps[name].any()]
+        empty = self.viewed & ~np.any(list(maps.values()), axis=0)
+        add_legend_of_maps(axes, found, bool(empty.any()), not self.viewed.all())
         return axes
 
     def save(self, path: str | Path) -> None:

@@ -17,7 +17,7 @@ from zerobev.config import LABELS, NO_LABEL, CameraConfig
 from zerobev.evaluation.metrics import bootstrap_interval, class_iou, pixel_iou
 from zerobev.experiments.run_records import RunRecord
 from zerobev.geometry.cameras import Pose
-from zerobev.inference.bev_map import NOTHING, OUTSIDE
+from zerobev.inference.bev_map import CLASS_COLORS, NOTHING, OUTSIDE
 from zerobev.rendering.gbuffer import RayCaster
 from zerobev.report.claims import Verdict, limit_of
 from zerobev.report.names import named
@@ -25,8 +25,7 @@ from zerobev.report.paper import TABLES
 from zerobev.report.tables import rows_of
 from zerobev.scenes.scene import Scene
 
-#: One colour per class, in the order of `LABELS`; the hues of Okabe and Ito, which colour-blind readers can tell apart.
-COLORS = ("#3b3b3b", "#e3cf8f", "#d55e00", "#cc79a7", "#0072b2", "#009e73", "#56b4e9", "#e69f00")
+COLORS = CLASS_COLORS
 #: Our numbers, and the paper's.
 OURS, PAPER = COLORS[4], COLORS[2]
 #: (10, 3) uint8: classes, outside, nothing (`NO_LABEL`, the last).

@@ -8,13 +8,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from transformers import YolosConfig, YolosForObjectDetection
 
 from zerobev.common.errors import InputError
-from zerobev.config import CameraConfig
+from zerobev.config import LABELS, CameraConfig
 from zerobev.evaluation.motion import MovingPair, arrow_errors, motion_table, moving_pair, true_flow
 from zerobev.geometry.cameras import Pose
 from zerobev.inference import BevMap, Boxes, Flow, HubDetector, Projector
+from zerobev.inference.bev_map import CLASS_COLORS, NOTHING, OUTSIDE, colors_of
 from zerobev.inference.boxes import rendered_boxes
 from zerobev.inference.flow import flow_field, read_flo
 from zerobev.rendering.gbuffer import RayCaster
@@ -239,8 +242,28 @@ def test_a_map_is_metric(tmp_path):
         assert file["extent"].tolist() == [-2.5, 2.5, 0, 5] and file["scores"].tolist() == [0.5, 0.6, 0.7]
     axes = bev.show()
     assert axes.get_images()[0].get_extent() == [-2.5, 2.5, 0, 5] and "[m]" in axes.get_xlabel()
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["a 0.50", "b 0.60"]
+    legend = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert legend == ["a 0.50", "b 0.60", "nothing", "outside the view"]
     assert axes.lines[0].get_xydata()[0] == pytest.approx([-2.4375, 0.0625])
+
+
+def test_the_first_map_of_a_class_has_the_colour_of_all_figures():
+    names = ("shelf", "sofa", "sofa", "wall", "lamp")
+    colors = colors_of(names)
+    assert [colors[k] for k in (1, 3)] == [to_rgb(CLASS_COLORS[LABELS.index(names[k])]) for k in (1, 3)]
+    assert len(set(colors)) == 5 and colors[2] not in map(to_rgb, CLASS_COLORS)
+    values = np.zeros((5, 4, 4), np.float32)
+    values[1, 0, 0] = values[4, 0, 1] = 1
+    fov = np.arange(16).reshape(4, 4) < 12
+    bev = BevMap(values, names, values, fov, CameraConfig(fpv_px=4, bev_px=4))
+    image = bev.image()
+    expected = [colors[1], colors[4], to_rgb(NOTHING), to_rgb(OUTSIDE)]
+    np.testing.assert_allclose([image[0, 0], image[0, 1], image[0, 2], image[3, 0]], expected)
+    legend = bev.show(Figure().subplots()).get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["sofa", "lamp", "nothing", "outside the view"]
+    np.testing.assert_allclose([patch.get_facecolor()[:3] for patch in legend.get_patches()], expected)
+    full = BevMap(np.ones((13, 4, 4), np.float32), tuple("abcdefghijklm"), values, fov | True, bev.camera)
+    assert full.show(Figure().subplots()).get_legend().get_texts() == []  # too many for a legend, and no other cells
 
 
 # --- moved objects ------------------------------------------------------------------------------------------------

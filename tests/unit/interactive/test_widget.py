@@ -90,7 +90,7 @@ def test_a_click_selects_an_object(model, rgb, instances):
     for (row, column), number in {(55, 5): 0, (45, 20): 4, (21, 74): 7}.items():
         widget._handle_custom_msg({"row": row, "column": column}, [])
         np.testing.assert_array_equal(widget.mask, instances == number)
-        assert_shows(widget, view.project(instances == number))
+        assert_shows(widget, view.project(instances == number, names=[NAMES[number]]))
         assert widget.text.startswith(f"{NAMES[number]}: ") and widget.bev.labels == (NAMES[number],)
     receive(widget, widget.mask | painted((slice(0, 5), slice(0, 5))))
     assert widget.bev.labels == ("mask",)
@@ -200,8 +200,8 @@ at("pointerdown", 40, 30);
 found.erased = sent.at(-1);
 press("clear");
 found.cleared = sent.at(-1);
-for (const name of ["map", "text", "bits"]) model.set(name, answer[name]);
-found.answered = [color(image, 40, 30), color(image, 40, 40)];
+for (const name of ["map", "text", "bits", "color"]) model.set(name, answer[name]);
+found.answered = [color(image, 40, 20), color(image, 40, 40)];
 found.text = el.querySelector("output").textContent;
 found.plan = answer.places.map(([x, y]) => color(plan, x, y));
 remove();
@@ -246,8 +246,9 @@ def test_the_browser_paints_selects_and_shows_the_map(model, rgb, instances, tmp
     widget = zerobev.playground(rgb, model, instances=instances, names=NAMES)
     names = ("photograph", "size", "has_instances", "color", "bits", "map", "extent", "text")
     state = as_text({name: getattr(widget, name) for name in names})
-    widget.mask = painted((slice(38, 60), slice(0, 80)))
-    answer = as_text({name: getattr(widget, name) for name in ("bits", "map", "text")})
+    color = widget.color
+    widget.select(59, 0)
+    answer = as_text({name: getattr(widget, name) for name in ("bits", "color", "map", "text")})
     # the map is 296 pixels wide on the screen, from (36, 8) on
     side = len(widget.bev.fov)
     cells = [
@@ -266,8 +267,9 @@ def test_the_browser_paints_selects_and_shows_the_map(model, rgb, instances, tmp
     assert not stroke[~(disc(20, 30, 4) | disc(60, 30, 4) | painted((slice(26, 34), slice(20, 60))))].any()
     np.testing.assert_array_equal(mask_of(found["erased"]), stroke & ~disc(40, 30, 4))
     assert not mask_of(found["cleared"]).any()
-    for inside, outside in (found["overlay"], found["answered"][::-1]):
-        assert outside[3] == 0 and np.abs(np.array(inside[:3]) - widget.color).max() <= 1 and 0 < inside[3] < 255
+    assert widget.color != color  # of a class, instead of a mask without a name
+    for (inside, outside), shown in ((found["overlay"], color), (found["answered"][::-1], widget.color)):
+        assert outside[3] == 0 and np.abs(np.array(inside[:3]) - shown).max() <= 1 and 0 < inside[3] < 255
     assert found["text"] == widget.text
     np.testing.assert_array_equal(np.ravel(found["plan"]), np.frombuffer(widget.map, np.uint8))
     assert len(np.unique(found["plan"], axis=0)) > 3

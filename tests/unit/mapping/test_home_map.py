@@ -252,7 +252,8 @@ def test_a_picture_shows_each_layer_and_what_was_seen():
     colours = np.unique(home.image().reshape(-1, 3), axis=0, return_counts=True)
     assert sorted(colours[1].tolist()) == [1, 4, 11, 48]
     axes = home.show(Figure().subplots())
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["floor", "chair"]
+    legend = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert legend == ["floor", "chair", "nothing", "outside the view"]
     assert axes.get_images()[0].get_extent() == [0, 8, 0, 8]
 
 
