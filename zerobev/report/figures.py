@@ -64,7 +64,7 @@ def averages_figure(number: int, records: Sequence[RunRecord]) -> Figure:
     Axes do not begin at zero, so that small differences are visible.
     """
     rows = [row for row in rows_of(number) if any(record.row == row for record in records)]
-    figure, panels = plt.subplots(1, 2, figsize=(9, 1.3 + 0.3 * len(rows)), sharey=True)
+    figure, panels = plt.subplots(1, 2, figsize=(7, 1.2 + 0.38 * len(rows)), sharey=True)
     for axes, (name, statistic) in zip(panels, {"class": class_iou, "pixel": pixel_iou}.items()):
         for y, row in enumerate(rows):
             counts = [record.counts for record in records if record.row == row]
@@ -75,10 +75,12 @@ def averages_figure(number: int, records: Sequence[RunRecord]) -> Figure:
             if (of_paper := TABLES.get(number, {}).get(row)) is not None:
                 value = of_paper.class_iou if name == "class" else of_paper.pixel_iou
                 paper = axes.plot(value, y, "x", color=PAPER, markeredgewidth=2, clip_on=False)
-        axes.set(xlabel=f"{name} IoU [%]", ylim=(len(rows) - 0.5, -0.5))
+        axes.set(xlabel=f"{name} IoU [%]", ylim=(len(rows) - 0.6, -0.6))
         axes.margins(x=0.08)
         axes.grid(axis="x", alpha=0.3)
-    panels[0].set_yticks(range(len(rows)), [named(row) for row in rows])
+    panels[0].set_yticks([])
+    for y, row in enumerate(rows):
+        _text_above(panels[0], y, named(row))
     marks = {"ours, 90 % interval": ours} | ({"the paper's": paper} if number in TABLES else {})
     figure.tight_layout()
     handles = [mark[0] for mark in marks.values()]
@@ -86,6 +88,7 @@ def averages_figure(number: int, records: Sequence[RunRecord]) -> Figure:
     return figure
 
 
+_LINEAR = 2  # the scoreboard's axis is linear up to so many points
 _MARKS = {"holds": ("o", OURS), "undecided": ("D", "#8c8c8c"), "does not hold": ("s", PAPER)}
 
 
@@ -96,32 +99,42 @@ def scoreboard_figure(verdicts: Sequence[Verdict]) -> Figure:
     """
     shown = sorted((v for v in verdicts if v.ours is not None), key=lambda v: v.table)
     tables = [v.table for v in shown]
-    figure, axes = plt.subplots(figsize=(10, 1.2 + 0.27 * len(shown)))
+    figure, axes = plt.subplots(figsize=(6, 1.6 + 0.36 * len(shown)))
     axes.axvline(0, color="black", linewidth=0.8)
+    for border in (-_LINEAR, _LINEAR):
+        axes.axvline(border, color="#cccccc", linewidth=0.8, linestyle=":")
     for y, v in enumerate(shown):
         assert v.ours is not None and v.low is not None and v.high is not None  # as selected above
         marker, color = _MARKS[v.verdict]
         if (limit := limit_of(v)) is not None:
-            axes.plot([0, limit], [y, y], color=COLORS[6], linewidth=9, alpha=0.4, solid_capstyle="butt")
+            axes.plot([0, limit], [y, y], color=COLORS[6], linewidth=8, alpha=0.4, solid_capstyle="butt")
         axes.plot([v.low, v.high], [y, y], color=color, linewidth=2)
         axes.plot(v.ours, y, marker, color=color, markersize=6)
         if v.paper is not None:
             axes.plot(v.paper, y, "x", color="black", markersize=6)
+        _text_above(axes, y, f"{v.id}  {_short(v)}")
         if y and tables[y] != tables[y - 1]:
-            axes.axhline(y - 0.5, color="#cccccc", linewidth=0.8)
+            axes.axhline(y - 0.6, color="#777777", linewidth=0.8)
     ticks = [-20, -5, -2, -1, 0, 1, 2, 5, 20]
-    axes.set_xscale("symlog", linthresh=2, linscale=1)
+    axes.set_xscale("symlog", linthresh=_LINEAR, linscale=1)
     axes.set_xticks(ticks, [f"{tick:+d}" if tick else "0" for tick in ticks])
     axes.minorticks_off()
-    axes.set_yticks(range(len(shown)), [f"{v.id}  {_short(v)}" for v in shown], fontsize=8)
-    axes.set(xlabel="difference or spread, IoU points", ylim=(len(shown) - 0.5, -0.5))
+    axes.set_yticks([])
+    axes.set(ylim=(len(shown) - 0.6, -0.6))
+    axes.set_xlabel("difference or spread, IoU points; linear between the dotted lines, logarithmic beyond", fontsize=9)
     axes.margins(x=0.05)
     marks: list[Artist] = [Line2D([], [], marker=m, color=c, label=f"ours: {name}") for name, (m, c) in _MARKS.items()]
     marks += [Line2D([], [], marker="x", color="black", linestyle="", label="the paper's")]
     marks += [Patch(color=COLORS[6], alpha=0.4, label="limit of a spread")]
-    axes.legend(handles=marks, fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.35, 1), frameon=False)
+    axes.legend(handles=marks, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False)
     figure.tight_layout()
     return figure
+
+
+def _text_above(axes: Axes, y: float, text: str) -> None:
+    """Write above the marks at height `y`, from the left side on: figures stay narrow, and can be read on a phone."""
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+    axes.text(0.01, y - 0.32, text, transform=axes.get_yaxis_transform(), va="center", fontsize=8, bbox=box)
 
 
 def _short(verdict: Verdict) -> str:

@@ -70,7 +70,7 @@ def write_summary(workspace: Workspace) -> Path:
         counted={name: of_paper[name] for name in VERDICTS if of_paper[name]},
         verdicts=sorted(verdicts, key=lambda verdict: verdict.table),
         scoreboard=_scoreboard(verdicts, folder),
-        notebooks={path.stem.partition("_")[0]: _link(path, folder) for path in sorted(NOTEBOOKS.glob("*.ipynb"))},
+        notebooks={_title(path): _link(path, folder) for path in sorted(NOTEBOOKS.glob("*.ipynb"))},
         ratios=ratios,
         tables=[_table(number, frame, records, folder) for number, frame in tables.items()],
         gallery=_gallery(workspace, records),
@@ -98,6 +98,11 @@ def _template() -> jinja2.Template:
     environment.filters["signed"] = lambda value: "" if value is None else f"{value:+.1f}"
     environment.filters["css"] = lambda verdict: verdict.replace(" ", "-")
     return environment.get_template("page.html.j2")
+
+
+def _title(notebook: Path) -> str:
+    """The first heading of a notebook."""
+    return str(nbformat.read(notebook, as_version=4).cells[0].source.splitlines()[0].removeprefix("# "))
 
 
 def _link(notebook: Path, folder: Path) -> str:
