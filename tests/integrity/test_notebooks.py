@@ -117,7 +117,7 @@ def contains_no_machine_paths(notebook: NotebookNode) -> None:
 
 def cells_are_short(notebook: NotebookNode) -> None:
     lines = [len(cell.source.splitlines()) for cell in code_cells(notebook)]
-    assert statistics.median(lines) <= 6 and max(lines) <= 25
+    assert statistics.median(lines) <= 5 and max(lines) <= 25
 
 
 def prose_precedes_every_code_cell(notebook: NotebookNode) -> None:
@@ -256,7 +256,7 @@ SPOILED = (
     (contains_no_machine_paths, set_source(5, 'open("../homes")')),
     (contains_no_machine_paths, set_output(5, new_output("stream", text="in /tmp/kernel_1"))),
     (cells_are_short, set_source(5, "1\n" * 29)),
-    (cells_are_short, lambda notebook: [cell.update(source="1\n" * 7) for cell in code_cells(notebook)]),
+    (cells_are_short, lambda notebook: [cell.update(source="1\n" * 6) for cell in code_cells(notebook)]),
     (prose_precedes_every_code_cell, lambda notebook: notebook.cells.pop(2)),
     (prose_precedes_every_code_cell, lambda notebook: [cell.update(source="Now:") for cell in notebook.cells[::2]]),
     (states_its_time, set_source(0, "Zero-BEV")),
