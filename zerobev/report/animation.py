@@ -43,7 +43,9 @@ def walk_animation(
     panels[0].set_axis_off()
     panels[2].set_title("true map", fontsize=8)
     for panel in panels[1:]:
-        panel.tick_params(labelsize=6)
+        panel.tick_params(labelsize=8)
+        panel.set_xlabel("x [m]", fontsize=8)
+        panel.set_ylabel("y [m]", fontsize=8)
     x, y = (np.array([getattr(pose, axis) for pose in poses]) for axis in ("x", "y"))
     frames = []
     for views, classes, viewed in maps:
