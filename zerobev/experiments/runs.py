@@ -77,7 +77,7 @@ class Run:
             if scale.objects_fraction and wanted.stream == "synth":
                 config |= {"objects_fraction": scale.objects_fraction}
             if scale.mixed_depth and wanted.reads_depth:
-                config |= {"mixed_depth": True}
+                config |= {"mixed_depth": versions.MIXED_DEPTH}
         return config
 
     @property
