@@ -260,7 +260,7 @@ _DEPLOY = replace(
     camera=CameraConfig(fpv_px=128, bev_px=40),
     scenes=SceneConfig(train=200, validation=4, test=16, views=60, homes="varied", heights_m=(0.3, 1.8)),
     model=replace(_LARGER, seen=True, floor_depth=True, own_rays=True),
-    train=TrainConfig(steps=15_000, learning_rate=2e-3, decay_every=375, decay=0.9, validate_every=1000, warmup=100),
+    train=TrainConfig(steps=10_000, learning_rate=1e-3, decay_every=250, decay=0.9, validate_every=1000, warmup=100),
     depth=TrainConfig(steps=20_000, learning_rate=4e-3, decay_every=500, decay=0.9, validate_every=2000, warmup=100),
     objects_fraction=0.5,
     augment=AugmentConfig(looks=0.9, cameras=0.3, mirrored=0.5),

@@ -89,9 +89,12 @@ def counted(verdicts: Sequence[Verdict]) -> str:
     return ", ".join(f"{number} {word}" for word, number in numbers.items() if number)
 
 
-def order_of(value: float) -> str:
-    """An error as the power of ten above it, 1e-6 or more, so that rounding on another machine does not change it."""
-    return f"below 1e{math.floor(math.log10(max(abs(value), 1e-7))) + 1}"
+def order_of(value: float, least: float = 1e-6) -> str:
+    """An error as the power of ten above it, at least `least`, so that rounding on another machine does not change it.
+
+    least: a power of ten, above errors of rounding
+    """
+    return f"below 1e{math.floor(math.log10(max(abs(value), 0.5 * least))) + 1}"
 
 
 class Checks:

@@ -210,6 +210,7 @@ def test_checks_show_the_numbers_of_verdicts():
 )
 def test_order_of_a_small_number(value, text):
     assert order_of(value) == text
+    assert order_of(9e-7, 1e-5) == order_of(2e-6, 1e-5) == "below 1e-5"
 
 
 def test_scoreboard_links_every_claim_to_an_existing_notebook():
