@@ -13,7 +13,7 @@ _LOST_IF_DARK = 0.7  # fraction of values lost at such surfaces
 _HOLES = 3  # mean number of further holes per image
 _MIN_KNOWN = 64  # pixels with a value from which the scale of an estimate is taken
 # powers of an estimate's relative error: the estimator has seen the views of the training, and its errors in other
-# views are about 1.5 times as large
+# views are about 1.4 times as large
 _POWERS = (1.0, 2.0)
 
 
