@@ -212,7 +212,8 @@ def test_depth_of_any_quality_occurs():
         found = mixed_depth(depth, estimated, grey, rng)
         if np.array_equal(found, depth):
             kinds.append("true")
-        elif np.array_equal(found, estimated):
+        elif found.min() == found.max() and found.min() >= 3:  # errors are exaggerated, never reduced
+            assert found.max() <= 2 * (3 / 2) ** 2 + 1e-6  # up to the square of the ratio
             kinds.append("estimated")
         elif not found.any():
             kinds.append("none")
