@@ -21,7 +21,7 @@ from zerobev.experiments.runs import Run
 from zerobev.experiments.workspace import Workspace
 from zerobev.inference.shipped_weights import DEPTH, FOLDER, ROWS
 
-SCALE = "reduced"
+SCALE = "deploy"
 _SEED = 0
 
 

@@ -76,7 +76,7 @@ def test_the_package_imports_torch_only_on_use():
 
 def test_the_weights_are_small_and_come_from_the_recorded_runs():
     files = {path.stem: path for path in FOLDER.glob("*")}
-    assert set(files) == {*ROWS, DEPTH} and sum(path.stat().st_size for path in files.values()) < 12e6
+    assert set(files) == {*ROWS, DEPTH} and sum(path.stat().st_size for path in files.values()) < 30e6
     assert {name: run_of(path) for name, path in files.items()} == {name: one.key for name, one in sources().items()}
     for row in ROWS:
         assert (ROOT / "reports" / SCALE / "records" / f"{run_of(files[row])}.json").exists()
@@ -177,7 +177,9 @@ def test_parts_outside_a_narrow_photograph_are_outside_the_field_of_view(rgb):
 
 
 def test_boxes_have_label_score_and_position(rgb):
-    boxes = zerobev.Boxes(np.array([[30.0, 28, 34, 36], [44, 28, 48, 36]]), ("a", "b"), np.array([0.9, 0.4]))
+    x, y = SIDE // 2, SIDE // 2 - 4
+    corners = np.array([[x - 2.0, y, x + 2, y + 8], [x + 12, y, x + 16, y + 8]])
+    boxes = zerobev.Boxes(corners, ("a", "b"), np.array([0.9, 0.4]))
     table = flat(3.0).project(rgb, boxes).footprints()
     assert table["label"].tolist() == ["a", "b"] and table["score"].tolist() == [0.9, 0.4]
     np.testing.assert_allclose(table["right_m"], [0, 14 / CAMERA.focal_px * 3], atol=0.07)
@@ -235,7 +237,7 @@ class Coarse:
         return rgb.mean(dim=1, keepdim=True) * self.factor
 
 
-@pytest.mark.parametrize(("side", "seen"), [(1000, 256), (150, 150), (64, 64), (40, 64)])
+@pytest.mark.parametrize(("side", "seen"), [(1000, 256), (150, 150), (SIDE, SIDE), (100, SIDE)])
 def test_the_input_of_an_estimator_has_its_size_up_to_the_photograph_s(side, seen):
     estimator = Coarse()
     row, column = np.mgrid[:side, :side] / side
@@ -287,7 +289,7 @@ def test_a_limit_on_heights_follows_the_camera_s_height():
 @pytest.mark.parametrize(
     ("depth", "message"),
     [
-        (np.ones((3, 3)), r"expected the photograph's size \(64, 64\), found \(3, 3\)"),
+        (np.ones((3, 3)), rf"expected the photograph's size \({SIDE}, {SIDE}\), found \(3, 3\)"),
         (np.full((SIDE, SIDE), 2000, np.uint16), "expected floating point, metres, found uint16; millimetres"),
         (np.full((SIDE, SIDE), 2000.0), "expected metres, found a median of 2000: millimetres?"),
         (np.full((SIDE, SIDE), -1.0), "found infinity or less than 0"),
@@ -305,7 +307,10 @@ def test_depth_of_a_sensor_is_checked(depth, message, rgb):
         (lambda rgb: torch.full((1, 1, SIDE, SIDE), 2300.0), "expected depth in metres, found a median of 2300"),
         (lambda rgb: torch.full((1, 1, SIDE, SIDE), -1.0), "expected finite depth from 0 up"),
         (lambda rgb: torch.full((1, 1, SIDE, SIDE), float("nan")), "expected finite depth from 0 up"),
-        (lambda rgb: torch.ones(1, SIDE, SIDE), r"expected depth \(1, 1, 64, 64\), found \(1, 64, 64\)"),
+        (
+            lambda rgb: torch.ones(1, SIDE, SIDE),
+            rf"expected depth \(1, 1, {SIDE}, {SIDE}\), found \(1, {SIDE}, {SIDE}\)",
+        ),
     ],
 )
 def test_depth_that_is_not_in_metres_is_refused(estimate, message, rgb):
@@ -335,7 +340,8 @@ def test_invalid_photographs_are_refused(photograph, message):
 
 
 def test_masks_of_another_size_and_no_boxes_are_refused(rgb):
-    with pytest.raises(InputError, match=r"modality: expected \(64, 64\) or \(K, 64, 64\) of bool, found \(32, 32\)"):
+    expected = rf"modality: expected \({SIDE}, {SIDE}\) or \(K, {SIDE}, {SIDE}\) of bool, found \(32, 32\)"
+    with pytest.raises(InputError, match=expected):
         flat(1.0).project(rgb, np.ones((32, 32), bool))
     with pytest.raises(InputError, match="modality: expected an array, found list"):
         flat(1.0).project(rgb, [[True], [True, False]])
@@ -385,10 +391,11 @@ def test_the_command_takes_a_camera_and_the_depth_of_a_sensor(models, rgb, masks
     Image.fromarray(rgb).save(photo)
     Image.fromarray(masks[0].astype(np.uint8)).save(mask)
     depth = np.full((SIDE, SIDE), 2.5, np.float32)
+    lens = (0.7 * SIDE, 0.78 * SIDE, SIDE / 2 - 2, SIDE / 2 + 1)
     np.save(tmp_path / "depth.npy", depth)
-    options = ("--lens", 45, 50, 30, 33, "--height", 1.2, "--pitch", -15, "--roll", 3)
+    options = ("--lens", *lens, "--height", 1.2, "--pitch", -15, "--roll", 3)
     command(photo, "--masks", mask, *options, "--depth", tmp_path / "depth.npy", "--out", out, "--row", "a.2")
-    camera = zerobev.Camera(fx=45, fy=50, cx=30, cy=33, height_m=1.2, pitch_deg=-15, roll_deg=3)
+    camera = zerobev.Camera(**dict(zip(("fx", "fy", "cx", "cy"), lens)), height_m=1.2, pitch_deg=-15, roll_deg=3)
     expected = models["a.2"].project(rgb, masks[0], camera, depth)
     assert expected.maps.any()
     with np.load(out.with_suffix(".npz")) as file:
