@@ -4,4 +4,4 @@ DATA = 2  #: homes, views, textures
 RECIPE = 4  #: training and evaluation of a run
 DEPTH = 1  #: training of the depth estimator
 MIXED_DEPTH = 2  #: depth of any quality in training
-BENCHMARK = 5  #: measurements of the benchmark
+BENCHMARK = 6  #: measurements of the benchmark

@@ -84,7 +84,12 @@ def test_the_weights_are_small_and_come_from_the_recorded_runs():
 
 
 def test_half_precision_only_rounds():
-    recorded = DepthNet.load(DepthPretraining(Workspace(SCALE)).weights).state_dict()
+    source = DepthPretraining(Workspace(SCALE))
+    if source.recorded() is None:
+        pytest.skip(
+            "weights in full precision are not in this checkout; `zerobev run --scale deploy --row a.2` trains them"
+        )
+    recorded = DepthNet.load(source.weights).state_dict()
     for name, tensor in DepthNet.load(shipped(DEPTH)).state_dict().items():
         assert tensor.dtype == recorded[name].dtype
         torch.testing.assert_close(tensor, recorded[name], rtol=2**-10, atol=1e-7)
