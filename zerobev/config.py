@@ -169,9 +169,15 @@ class ModelConfig:
     aux: tuple[str, ...] = AUX  #: auxiliary maps predicted beside the zero-shot map, in the order of `AUX`
     residual: bool = False  #: add P^-1 of the zero-shot image to the map features (Zero-BEV, rows (d))
     seen: bool = False  #: beside that, which cells P^-1 sees at all
+    measured: bool = False  #: and which of them by measured depth, see `models.base.BevModel`
     floor_depth: bool = False  #: estimated depth is at most that of the floor
     own_rays: bool = False  #: the depth estimator reads the rays of the image's own camera, from its height
     segmentation: bool = False  #: masks of the eight classes as input (TIM, row (b.3))
+
+    @property
+    def projected(self) -> int:
+        """Number of maps by P^-1 that a residual network reads per zero-shot image."""
+        return 1 + self.seen + self.measured
 
 
 @dataclass(frozen=True)
@@ -213,7 +219,8 @@ class Scale:
     objects_fraction: float = 0.0  #: fraction of *Synth* samples with whole instances in white (not in the paper)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     relative_depth: bool = False  #: the depth estimator's loss is the relative error (not in the paper)
-    mixed_depth: bool = False  #: residual networks are trained with depth of any quality (not in the paper)
+    #: residual networks are trained with depth of any quality, and know which is measured (not in the paper)
+    mixed_depth: bool = False
     test_views: int | None = None  #: networks are evaluated on the first so many of each test scene; None: all
     #: initial weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's
     backbone: str = ""

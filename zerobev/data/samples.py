@@ -2,9 +2,9 @@
 
 Batches are dicts of tensors (B samples, K modalities, H pixels and M cells per side): `rgb` (B, 3, H, H) uint8; `zero`
 (B, K, H, H) and `target` (B, K, M, M) bool; `aux` (B, 2, M, M) bool, obstacles and navigable space; `fov` (B, 1, M, M)
-bool; `depth` (B, 1, H, H) float32, metres; `scene` (B,) int64. Images and masks are sent to processes and GPUs with
-one byte per value; networks take the result of `as_float`. If views are from different heights, batches have `height`
-(B,) float32, metres.
+bool; `depth` (B, 1, H, H) float32, metres, or of any quality (B, 2, H, H), see `sensor_depth.mixed_depth`; `scene` (B,)
+int64. Images and masks are sent to processes and GPUs with one byte per value; networks take the result of `as_float`.
+If views are from different heights, batches have `height` (B,) float32, metres.
 """
 
 from abc import ABC, abstractmethod
@@ -86,7 +86,7 @@ class SampleStream(ABC):
         sample = view_sample(view, self._camera, scene, zero, target)
         estimate = self._views.estimate(number)
         if estimate is not None:
-            sample["depth"] = mixed_depth(view.depth, estimate, view.rgb, rng)[None]
+            sample["depth"] = mixed_depth(view.depth, estimate, view.rgb, rng)
         return self._augment(sample, view, self._views.shards[scene].charts, rng) if self._augment else sample
 
 

@@ -51,6 +51,11 @@ def completed(known: np.ndarray, estimated: np.ndarray) -> np.ndarray:
     return np.where(valid, known, estimated).astype(np.float32)
 
 
+def with_measured(measured: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Depth and a mask of the pixels with a measured value, (..., 2, H, W) float32, from two images (..., H, W)."""
+    return np.stack([depth, measured > 0], axis=-3).astype(np.float32)
+
+
 def exaggerated(estimated: np.ndarray, depth: np.ndarray, power: float) -> np.ndarray:
     """`depth * (estimated / depth) ** power`, (H, W) float32, metres; the estimate itself where true depth is 0."""
     known = (depth > 0) & (estimated > 0)
@@ -59,21 +64,21 @@ def exaggerated(estimated: np.ndarray, depth: np.ndarray, power: float) -> np.nd
 
 
 def mixed_depth(depth: np.ndarray, estimated: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Depth of a random quality, (H, W) float32, metres: true, measured, estimated, or missing, in part or wholly.
+    """Depth of a random quality: true, measured, estimated, or missing, in part or wholly.
 
     Measured depth is completed by the estimate in half of the samples; otherwise its holes stay 0. Errors of the
     estimate are exaggerated at random.
+    Returns (2, H, W) float32: metres, and 1 where depth is true or measured.
     """
     kind = rng.integers(5)
     estimated = exaggerated(estimated, depth, rng.uniform(*_POWERS))
     if kind == 0:
-        return depth.astype(np.float32)
-    if kind == 1:
-        return estimated
-    if kind == 2:
-        return np.zeros(depth.shape, np.float32)
+        return with_measured(depth, depth)
+    if kind in (1, 2):
+        none = np.zeros_like(estimated)
+        return with_measured(none, estimated if kind == 1 else none)
     measured = sensor_depth(depth, rgb, rng)
-    return completed(measured, estimated) if kind == 3 else measured
+    return with_measured(measured, completed(measured, estimated) if kind == 3 else measured)
 
 
 def _ellipse(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

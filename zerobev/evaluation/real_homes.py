@@ -26,7 +26,7 @@ from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.data.samples import as_float, class_masks, collate, view_sample
-from zerobev.data.sensor_depth import completed, sensor_depth
+from zerobev.data.sensor_depth import completed, sensor_depth, with_measured
 from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
@@ -199,9 +199,13 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
     batch = render_views(folder, views, camera, seed)
     with torch.inference_mode():
         estimated = estimate(projectors[ROWS[0]].estimator, batch["rgb"], batch.get("height"))
-    pairs = zip(batch["sensor"].numpy(), estimated.numpy())
-    measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
-    depths = {"": estimated, ".none": torch.zeros_like(estimated), ".true": batch["depth"], ".sensor": measured}
+    true, sensor = batch["depth"].numpy()[:, 0], batch["sensor"].numpy()[:, 0]
+    filled = np.stack([completed(*pair) for pair in zip(sensor, estimated.numpy()[:, 0])])
+    depths = {"": estimated, ".none": torch.zeros_like(estimated)}
+    depths |= {
+        suffix: torch.from_numpy(with_measured(*pair))
+        for suffix, pair in ((".true", (true, true)), (".sensor", (sensor, filled)))
+    }
     heights = batch.get("height")
     maps = {
         ORACLE: inverse_project(batch["zero"], batch["depth"], camera, heights) > 0,

@@ -19,7 +19,7 @@ from torch import Tensor
 from zerobev.common.progress import progress
 from zerobev.config import LABELS, AgentConfig, CameraConfig
 from zerobev.data.samples import as_float
-from zerobev.data.sensor_depth import completed, sensor_depth
+from zerobev.data.sensor_depth import completed, sensor_depth, with_measured
 from zerobev.evaluation.home_scores import HomeScores
 from zerobev.evaluation.real_homes import METHODS, ORACLE
 from zerobev.geometry.cameras import Pose
@@ -156,16 +156,17 @@ def walk_maps(walked: Walk, rows: Collection[str] = tuple(WALK_ROWS)) -> dict[st
     estimator = load(GEOMETRIC).estimator
     with torch.inference_mode():
         estimated = torch.cat([estimator(as_float(part)["rgb"]) for part in _chunks(walked.views)])
-    pairs = zip(walked.views["sensor"].numpy(), estimated.numpy())
-    measured = torch.from_numpy(np.stack([completed(*pair) for pair in pairs]))
+    sensor = walked.views["sensor"].numpy()[:, 0]
+    filled = np.stack([completed(*pair) for pair in zip(sensor, estimated.numpy()[:, 0])])
+    measured = torch.from_numpy(with_measured(sensor, filled))
     found = {}
     for row in rows:
         name = row.removesuffix(".sensor")
         depth = walked.views["depth"] if row == ORACLE else measured if name != row else estimated
         if name in (ORACLE, GEOMETRIC):
             zero = walked.views["zero"].float()
-            values = inverse_project(zero, depth, walked.camera)
-            fov = inverse_project(torch.ones_like(depth), depth, walked.camera)[:, 0].numpy() > 0
+            values = inverse_project(zero, depth[:, :1], walked.camera)
+            fov = inverse_project(torch.ones_like(depth[:, :1]), depth[:, :1], walked.camera)[:, 0].numpy() > 0
         else:
             network = load(name).network
             assert network is not None  # as of all shipped rows

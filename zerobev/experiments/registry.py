@@ -49,11 +49,10 @@ class Experiment:
 
     def model(self, scale: Scale) -> ModelConfig:
         """Configuration of the network, before the changes of its variant."""
+        model = replace(scale.model, measured=True) if scale.mixed_depth and self.reads_depth else scale.model
         if not self.paper_start:
-            return scale.model
-        return replace(
-            scale.model, ground_start=False, zero_init_gain=1.0, residual_init_gain=1.0, foreground_prior=0.5
-        )
+            return model
+        return replace(model, ground_start=False, zero_init_gain=1.0, residual_init_gain=1.0, foreground_prior=0.5)
 
     def extruded_fraction(self, scale: Scale) -> float:
         """Fraction of training samples with extruded textures."""

@@ -4,7 +4,8 @@ Reads weights as `zerobev project` does; writes one ONNX file in float32, whose 
 metadata `camera` contains the camera and the map as JSON. The numbers of photographs B and of images K are free.
 
     zero-shot network: rgb (B, 3, S, S) in [0, 1], zero (B, K, S, S) of 0 and 1 -> logits (B, K, M, M)
-    residual network:  also depth (B, 1, S, S), metres, and height_m (B,) of the cameras
+    residual network:  also depth (B, 1, S, S), metres, and height_m (B,) of the cameras; with `ModelConfig.measured`
+                       depth (B, 2, S, S), whose second channel is 1 where a sensor measured, else 0
     depth estimator:   rgb (B, 3, S, S) -> depth (B, 1, S, S), metres; with `own_rays` also height_m (B,)
 
 All are float32, and images are those of the level camera of the metadata. A residual network's depth is that of the
@@ -96,7 +97,10 @@ def _example(network: BevModel, batch: int, images: int) -> dict[str, Tensor]:
     if isinstance(network, ZeroShotModel):
         inputs["zero"] = torch.rand(batch, images, side, side, generator=generator).round()
         if network.config.residual:
-            inputs["depth"] = network.camera.bev_extent_m * torch.rand(batch, 1, side, side, generator=generator)
+            shape = batch, 1 + network.config.measured, side, side
+            inputs["depth"] = network.camera.bev_extent_m * torch.rand(shape, generator=generator)
+            if network.config.measured:
+                inputs["depth"][:, 1] = inputs["depth"][:, 1] > network.camera.bev_extent_m / 2
     if network.config.own_rays if isinstance(network, DepthNet) else network.config.residual:
         inputs["height_m"] = network.camera.height_m * (1 + torch.rand(batch, generator=generator))
     return inputs

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
-from zerobev.data.sensor_depth import completed
+from zerobev.data.sensor_depth import completed, with_measured
 from zerobev.geometry.cameras import Camera
 from zerobev.inference.measured_depth import MAX_MEDIAN_M
 from zerobev.inference.pinhole import PinholeView
@@ -27,8 +27,9 @@ def image_depths(
     source: Camera,
     network: CameraConfig,
 ) -> np.ndarray:
-    """Planar depth of B photographs (H, W, 3) in the network's camera, (B, S, S) float32, metres; 0 outside of them.
+    """Planar depth of B photographs (H, W, 3) in the network's camera, (B, 2, S, S) float32.
 
+    Returns metres, 0 outside of the photographs; and 1 where they are a sensor's.
     views: of the photographs, from `source` to `network`
     measured: (H, W) float32 per photograph, see `checked_depth`; None: all depth is estimated
     The estimator is called once for all photographs whose input has the same size, and not at all for complete depth.
@@ -41,10 +42,10 @@ def image_depths(
     depths = []
     for number, (depth, view) in enumerate(zip(known, views)):
         if depth is None:
-            depth = estimated[number]
-        elif number in estimated:
-            depth = completed(depth, estimated[number])
-        depths.append(depth * view.covered)
+            depths.append(with_measured(np.zeros_like(estimated[number]), estimated[number]) * view.covered)
+        else:
+            filled = completed(depth, estimated[number]) if number in estimated else depth
+            depths.append(with_measured(depth, filled) * view.covered)
     return np.stack(depths)
 
 

@@ -93,7 +93,7 @@ def image_views(
     network, target = projector.network, projector.camera
     views = [PinholeView(photograph.shape[:2], camera, target) for photograph in photographs]
     depths = image_depths(projector.estimator, photographs, views, measured, camera, target)
-    depth = torch.from_numpy(depths)[:, None].to(projector.device)
+    depth = torch.from_numpy(depths).to(projector.device)
     heights = torch.full((len(views),), camera.height_m, device=projector.device)
     empty: list[Tensor | None] = [None] * len(views)
     if network is None:
@@ -109,8 +109,8 @@ def image_views(
             camera=camera,
             shape=photographs[n].shape[:2],
             pinhole=view,
-            depth=depths[n],
-            fov=fov_mask(depths[n], target.at_height(camera.height_m)),
+            depth=depths[n, 0],
+            fov=fov_mask(depths[n, 0], target.at_height(camera.height_m)),
             is_measured=measured[n] is not None,
             features=tuple(tensor[n : n + 1] for tensor in features),
             empty=empty[n],

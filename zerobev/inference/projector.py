@@ -179,7 +179,7 @@ class Projector:
         photograph = checked_image(rgb)
         view, measured = PinholeView(photograph.shape[:2], camera, self.camera), _measured(depth, photograph)
         with torch.inference_mode():
-            return image_depths(self.estimator, [photograph], [view], [measured], camera, self.camera)[0]
+            return image_depths(self.estimator, [photograph], [view], [measured], camera, self.camera)[0, 0]
 
     def predict(self, batch: Mapping[str, Tensor]) -> Tensor:
         """A batch of `data.samples` -> maps (B, K, M, M) bool, for `evaluation.evaluate`; with estimated depth."""

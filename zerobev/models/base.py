@@ -39,8 +39,10 @@ class BevModel(nn.Module):
     """A network with its configuration.
 
     Networks that predict maps are called as `model(rgb, zero, depth)` and return a `MapLogits`. Inputs, not all used by
-    every network: rgb (B, 3, H, W) in [0, 1], zero (B, K, H, W), depth (B, 1, H, W) in metres, all float32. Zero-shot
-    networks also take `height_m` (B,), the heights of the cameras of stretched images (`CameraConfig.at_height`).
+    every network: rgb (B, 3, H, W) in [0, 1], zero (B, K, H, W), depth (B, 1 or 2, H, W), all float32. The first
+    channel of depth is in metres. The second, used with `ModelConfig.measured`, is 1 where a sensor measured, and 0
+    where depth is estimated or unknown; without it, nothing is measured. Zero-shot networks also take `height_m` (B,),
+    the heights of the cameras of stretched images (`CameraConfig.at_height`).
 
     Raises `InputError` for unknown auxiliary maps.
     """
@@ -115,7 +117,7 @@ class ZeroShotModel(BevModel):
     ) -> MapLogits:
         """RGB (B, 3, H, W) in [0, 1], zero-shot images (B, K, H, W) in [0, 1], all float32 -> `MapLogits`.
 
-        depth: (B, 1, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
+        depth: (B, 1 or 2, H, W) metres, true or estimated, 0 for unknown; used only in the residual variant
         height_m: (B,) of the cameras, for the limit on heights of P^-1; default: `camera.height_m`
         """
         self.check(rgb=(rgb, 3), zero=(zero, None))
@@ -129,13 +131,15 @@ class ZeroShotModel(BevModel):
         batch = self.check(rgb=(rgb, 3))
         if not self.config.residual:
             return self.image_features(rgb)
-        self.check(batch, depth=(depth, 1))
+        masked = depth is not None and depth.ndim == 4 and depth.shape[1] == 2
+        self.check(batch, depth=(depth, 2 if masked else 1))
         assert depth is not None  # as checked
         cells = cells_of_pixels(depth[:, 0], self.camera, height_m)
-        if not self.config.seen:
-            return cells, *self.image_features(rgb)
-        everything = pooled_in_cells(torch.ones_like(rgb[:, :1]), cells, self.camera.bev_px)
-        return cells, everything, *self.image_features(rgb)
+        images = [torch.ones_like(rgb[:, :1])] if self.config.seen else []
+        if self.config.measured:
+            images.append(depth[:, 1:].to(rgb.dtype) if masked else torch.zeros_like(rgb[:, :1]))
+        maps = [pooled_in_cells(image, cells, self.camera.bev_px) for image in images]
+        return cells, *maps, *self.image_features(rgb)
 
     def decode(self, features: Features, zero: Tensor) -> MapLogits:
         """Zero-shot images (B, K, H, W) of the images of `encode` -> `MapLogits`.
@@ -145,10 +149,10 @@ class ZeroShotModel(BevModel):
         self.check(features[0].shape[0], zero=(zero, None))
         if not self.config.residual:
             return self.project_images(features, zero, None)
-        of_depth = 1 + self.config.seen
-        (cells, *everything), rest = features[:of_depth], features[of_depth:]
+        of_depth = self.config.projected
+        (cells, *of_view), rest = features[:of_depth], features[of_depth:]
         projected = pooled_in_cells(zero, cells, self.camera.bev_px)
-        maps = [projected, *(one.expand_as(projected) for one in everything)]
+        maps = [projected, *(one.expand_as(projected) for one in of_view)]
         return self.project_images(rest, zero, torch.stack(maps, dim=2))
 
     def image_features(self, rgb: Tensor) -> Features:
@@ -158,8 +162,8 @@ class ZeroShotModel(BevModel):
     def project_images(self, features: Features, zero: Tensor, projected: Tensor | None) -> MapLogits:
         """As `decode`, from `image_features`.
 
-        projected: (B, K, 1 or 2, M, M), P^-1 of the zero-shot images, and of the whole view with `ModelConfig.seen`;
-            None: not the residual variant
+        projected: (B, K, P, M, M), P^-1 of the zero-shot images, with `ModelConfig.seen` of the whole view, and with
+            `measured` of its measured pixels; None: not the residual variant
         """
         raise NotImplementedError
 

@@ -102,7 +102,7 @@ class MaxPoolZeroBEV(ZeroShotModel):
         self.resample_pixels = PolarToCartesian(camera, rows, 1)
         self.resample_features = PolarToCartesian(camera, rows, stride)
         self.values = nn.Conv2d(model.width, model.width, 1)
-        self.embedding = nn.Conv2d(1 + model.residual * (1 + model.seen), model.width, 1)
+        self.embedding = nn.Conv2d(1 + model.residual * model.projected, model.width, 1)
         with torch.no_grad():
             self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))

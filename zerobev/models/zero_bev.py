@@ -36,7 +36,7 @@ class ZeroBEV(ZeroShotModel):
         self.pyramid = FeaturePyramid(tuple(map(sum, zip(model.channels, model.zero_channels))), model.width)
         self.bands = FpvToBev(camera, model)
         if model.residual:
-            self.embedding = nn.Conv2d(1 + model.seen, model.width, 1)
+            self.embedding = nn.Conv2d(model.projected, model.width, 1)
             with torch.no_grad():
                 self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))

@@ -209,16 +209,21 @@ def test_depth_of_any_quality_occurs():
     depth, estimated = np.full((48, 48), 2.0, np.float32), np.full((48, 48), 3.0, np.float32)
     grey, kinds = np.full((48, 48, 3), 128, np.uint8), []
     for _ in range(200):
-        found = mixed_depth(depth, estimated, grey, rng)
+        found, measured = mixed_depth(depth, estimated, grey, rng)
         if np.array_equal(found, depth):
+            assert measured.all()
             kinds.append("true")
         elif found.min() == found.max() and found.min() >= 3:  # errors are exaggerated, never reduced
             assert found.max() <= 2 * (3 / 2) ** 2 + 1e-6  # up to the square of the ratio
+            assert not measured.any()
             kinds.append("estimated")
         elif not found.any():
+            assert not measured.any()
             kinds.append("none")
         else:
             kinds.append("holes" if (found == 0).any() else "completed")
+            assert 0 < measured.mean() < 1 and not (measured[found == 0]).any()
+            assert kinds[-1] == "completed" or np.array_equal(measured, found > 0)
             assert np.abs(found[found > 0] - 2).max() < 0.2  # the estimate is scaled to the measurement
     assert all(kinds.count(kind) > 15 for kind in ("true", "estimated", "none", "holes", "completed"))
 
@@ -238,4 +243,4 @@ def test_estimates_are_beside_the_true_depth(scene, views, bank, tmp_path):
     for index in range(6):
         a, b = plain.sample(index), other.sample(index)
         assert np.array_equal(a["zero"], b["zero"]) and np.array_equal(a["target"], b["target"])
-    assert any(not np.array_equal(plain.sample(i)["depth"], other.sample(i)["depth"]) for i in range(6))
+    assert any(not np.array_equal(plain.sample(i)["depth"][0], other.sample(i)["depth"][0]) for i in range(6))

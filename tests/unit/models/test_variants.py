@@ -282,6 +282,22 @@ def test_a_residual_network_may_know_which_cells_depth_shows(row):
     assert cells.any() and torch.equal(changed, cells > 0)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("row", ["d", "f.r"])
+def test_a_residual_network_may_know_which_cells_are_measured(row):
+    """The same depth, measured in the left half of the image or not at all: features of that half's cells differ."""
+    net, seen = build(row, SMOKE.camera, replace(SMOKE.model, seen=True, measured=True)).eval(), []
+    net.decoder.register_forward_pre_hook(lambda _, features: seen.append(features[0]))
+    rgb, zero, depth = torch.rand(1, 3, 32, 32), torch.zeros(1, 1, 32, 32), torch.full((1, 1, 32, 32), 2.0)
+    left = torch.zeros_like(depth)
+    left[..., :16] = 1
+    for of in (depth, torch.cat([depth, torch.zeros_like(depth)], dim=1), torch.cat([depth, left], dim=1)):
+        net(rgb, zero, of)
+    cells = inverse_project(left, depth, net.camera)[:, 0] > 0
+    assert torch.equal(seen[0], seen[1])  # without a mask nothing is measured
+    assert cells.any() and torch.equal((seen[2] != seen[0]).any(dim=1), cells)
+
+
 # --- inductive bias
 
 
