@@ -24,7 +24,7 @@ from zerobev.models.depth import DepthNet
 from support.paths import ROOT
 
 SMOKE = SCALES["smoke"]
-MODEL = replace(SMOKE.model, layers=1, seen=True, floor_depth=True)
+MODEL = replace(SMOKE.model, layers=1, seen=True, measured=True, floor_depth=True)
 #: Imports of torch fail.
 WITHOUT_TORCH = "import sys; sys.modules['torch'] = None\n"
 
@@ -48,7 +48,8 @@ def test_a_file_has_the_outputs_of_torch_for_any_number_of_images(row, tmp_path)
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx", providers=["CPUExecutionProvider"])
     for batch, images in ((1, 1), (1, 40), (3, 1), (2, 5)):
         rgb, zero = torch.rand(batch, 3, 32, 32), (torch.rand(batch, images, 32, 32) > 0.7).float()
-        depth, height_m = 0.3 + 4 * torch.rand(batch, 1, 32, 32), torch.linspace(0.3, 1.8, batch)
+        metres, measured = 0.3 + 4 * torch.rand(batch, 1, 32, 32), (torch.rand(batch, 1, 32, 32) > 0.5).float()
+        depth, height_m = torch.cat([metres, measured], dim=1), torch.linspace(0.3, 1.8, batch)
         if isinstance(net, ZeroShotModel):
             inputs = {"rgb": rgb, "zero": zero}
             if net.config.residual:

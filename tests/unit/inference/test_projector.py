@@ -4,6 +4,7 @@ import argparse
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -279,6 +280,20 @@ def test_the_map_follows_measured_depth(models, rgb):
         assert rows.tolist() == [CAMERA.bev_px - 1 - int(metres / CAMERA.cell_m)]
     near, far = (models["d"].project(rgb, mask, depth=np.full((SIDE, SIDE), z)).values for z in (1.5, 4.0))
     assert np.abs(near - far).max() > 0.1  # the residual network reads it
+
+
+def test_a_residual_network_gets_a_mask_of_the_measured_pixels(rgb):
+    """The left half is measured at 2 m; the estimate is 2 m everywhere, so P^-1 of the mask is that of the half."""
+    torch.manual_seed(0)
+    network = build("d", CAMERA, replace(SCALES["smoke"].model, seen=True, measured=True)).eval()
+    model = zerobev.Projector("d", CAMERA, network, lambda rgb: torch.full((len(rgb), 1, SIDE, SIDE), 2.0))
+    left = np.zeros((SIDE, SIDE), np.float32)
+    left[:, : SIDE // 2] = 2.0
+    views = [model.view(rgb), model.view(rgb, depth=left)]
+    cells, seen, measured = zip(*(view.features[:3] for view in views))
+    assert torch.equal(cells[0], cells[1]) and torch.equal(seen[0], seen[1]) and not measured[0].any()
+    expected = inverse_project(torch.from_numpy(left)[None, None].sign(), torch.full((1, 1, SIDE, SIDE), 2.0), CAMERA)
+    assert expected.any() and torch.equal(measured[1], expected)
 
 
 def test_a_limit_on_heights_follows_the_camera_s_height():
