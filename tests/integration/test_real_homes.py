@@ -119,8 +119,22 @@ def test_the_command_takes_every_home_and_skips_broken_ones_loudly(homes, tmp_pa
     for row, entry in found["rows"].items():
         counts = Counts.from_json(entry)
         assert counts.union.shape == (2, 8) and entry["class_iou"] == counts.class_iou()
-        weights = row.split(".")[0]
-        assert entry["weights"] == (run_of(shipped(weights)) if weights in ROWS else None)
+        (weights,) = [one for one in ROWS if row in (one, f"{one}.none", f"{one}.sensor", f"{one}.true")] or [None]
+        assert entry["weights"] == (run_of(shipped(weights)) if weights else None)
+
+
+def test_other_weights_are_evaluated_alike(homes, results, tmp_path):
+    """Those of (d), from a folder, have the counts of the shipped ones."""
+    model = load("d")
+    model.save_pretrained(tmp_path / "same")
+    found = evaluate_homes([homes / "val/00001-HomeA"], 3, seed=5, report=lambda line: None, weights=tmp_path / "same")
+    home = results.homes["00001-HomeA"]
+    assert list(found.counts) == ["a.1", "a.2", "own", "own.none", "own.sensor", "own.true", "constant"]
+    for row in ("own", "own.none", "own.sensor", "own.true"):
+        assert found.counts[row] == home.counts[row.replace("own", "d")]
+    assert found.homes["00001-HomeA"].depth == home.depth and "(own) has " in found.worst()[0]
+    with pytest.raises(InputError, match=r"weights: expected a network, found P\^-1"):
+        evaluate_homes([homes / "val/00001-HomeA"], 1, weights="a.2")
 
 
 def test_a_data_set_a_part_of_it_or_a_scene_are_accepted(homes, tmp_path):

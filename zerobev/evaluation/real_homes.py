@@ -1,16 +1,17 @@
-"""Evaluate the shipped weights on a folder of homes.
+"""Evaluate the shipped weights, or other ones, on a folder of homes.
 
 Reads homes in HM3DSem layout: a data set, one of its parts such as `val/`, or one scene. Prints IoU, depth errors and
 the homes that fail most, and writes all of it with `--json`. The networks were trained only on generated homes, so all
 annotated scenes of the folder are test scenes. Views are rendered, not stored. Rows: P^-1 with true depth (a.1) and
 with estimated depth (a.2); the shipped networks, residual ones also without depth (.none), with the depth of a depth
 camera (.sensor, see `data.sensor_depth`) and with true depth (.true); floor over the whole field of view (constant).
+With `--weights`, the row of the networks is `own`.
 """
 
 import argparse
 import sys
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -40,20 +41,29 @@ from zerobev.models.variants import VARIANTS
 from zerobev.scenes.readers import list_scenes, read_scene
 from zerobev.training.loader import Batch
 
-ORACLE, CONSTANT = "a.1", "constant"
-_RESIDUAL = tuple(row for row in ROWS if VARIANTS[row][1].get("residual"))
-#: Row -> title.
-METHODS = {
-    ORACLE: "P^-1 with true depth",
-    GEOMETRIC: "P^-1 with estimated depth",
-    **{row: f"Zero-BEV ({row})" for row in ROWS},
-    **{
-        f"{row}.{depth}": f"Zero-BEV ({row}) with {text}"
-        for row in _RESIDUAL
-        for depth, text in (("none", "no depth"), ("sensor", "a depth camera"), ("true", "true depth"))
-    },
-    CONSTANT: "floor over the whole field of view",
-}
+ORACLE, CONSTANT, OWN = "a.1", "constant", "own"
+_DEPTHS = {"none": "no depth", "sensor": "a depth camera", "true": "true depth"}
+
+
+def methods(residual: Mapping[str, bool]) -> dict[str, str]:
+    """Row -> title. residual: network -> whether it is a residual one."""
+    return {
+        ORACLE: "P^-1 with true depth",
+        GEOMETRIC: "P^-1 with estimated depth",
+        **{row: f"Zero-BEV ({row})" for row in residual},
+        **{
+            f"{row}.{depth}": f"Zero-BEV ({row}) with {text}"
+            for row, reads_depth in residual.items()
+            if reads_depth
+            for depth, text in _DEPTHS.items()
+        },
+        CONSTANT: "floor over the whole field of view",
+    }
+
+
+#: Row -> title, of the shipped networks.
+METHODS = methods({row: VARIANTS[row][1].get("residual", False) for row in ROWS})
+_TITLES = METHODS | methods({OWN: True})
 _FLOOR = LABELS.index("floor")
 _WORST = 3  # homes that are discussed
 # from here on, a property of a home counts as a reason of its failure
@@ -86,7 +96,7 @@ class DepthReport:
 
 @dataclass(frozen=True)
 class HomeResult:
-    """Counts of one home per row of `METHODS`, each with one scene, and its depth."""
+    """Counts of one home per row of `methods`, each with one scene, and its depth."""
 
     counts: dict[str, Counts]
     depth: DepthReport
@@ -98,11 +108,13 @@ class Results:
 
     homes: dict[str, HomeResult]
     broken: dict[str, str]
+    row: str = ROWS[-1]  #: the network whose failures are discussed
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """Counts per row of `METHODS`, a scene per home."""
-        per_row = {row: [home.counts[row] for home in self.homes.values()] for row in METHODS}
+        """Counts per row of `methods`, a scene per home."""
+        rows = next(iter(self.homes.values())).counts
+        per_row = {row: [home.counts[row] for home in self.homes.values()] for row in rows}
         return {
             row: Counts(
                 np.concatenate([one.intersection for one in counts]), np.concatenate([one.union for one in counts])
@@ -111,14 +123,14 @@ class Results:
         }
 
     def worst(self) -> list[str]:
-        """A line for each of the homes in which the last shipped row is worst, relative to the oracle (a.1)."""
+        """A line for each of the homes in which the network is worst, relative to the oracle (a.1)."""
 
         def share(home: HomeResult) -> float:
-            return home.counts[ROWS[-1]].class_iou() / max(home.counts[ORACLE].class_iou(), 1e-9)
+            return home.counts[self.row].class_iou() / max(home.counts[ORACLE].class_iou(), 1e-9)
 
         by_share = sorted(self.homes.items(), key=lambda item: share(item[1]))
         return [
-            f"{name}: ({ROWS[-1]}) has {share(home):.2f} of ({ORACLE})'s class IoU; {home.depth.reasons()}"
+            f"{name}: ({self.row}) has {share(home):.2f} of ({ORACLE})'s class IoU; {home.depth.reasons()}"
             for name, home in by_share[:_WORST]
         ]
 
@@ -128,7 +140,7 @@ class Results:
             row: {
                 "class_iou": one.class_iou(),
                 "pixel_iou": one.pixel_iou(),
-                "weights": run_of(shipped(_network_of(row))) if _is_network(row) else None,
+                "weights": run_of(shipped(network)) if (network := _network_of(row)) in ROWS else None,
                 **one.to_json(),
             }
             for row, one in self.counts.items()
@@ -138,14 +150,10 @@ class Results:
         return {"scenes": list(self.homes), "rows": rows, "depth": {**means, "by_home": by_home}}
 
 
-def _is_network(row: str) -> bool:
-    return row not in (ORACLE, GEOMETRIC, CONSTANT)
-
-
 def _network_of(row: str) -> str:
-    """The shipped row without the kind of its depth."""
+    """The row without the kind of its depth."""
     stem, _, kind = row.rpartition(".")
-    return stem if kind in ("none", "sensor", "true") else row
+    return stem if kind in _DEPTHS else row
 
 
 def render_views(folder: Path, views: int, camera: CameraConfig, seed: int) -> dict[str, Tensor]:
@@ -166,17 +174,25 @@ def render_views(folder: Path, views: int, camera: CameraConfig, seed: int) -> d
 
 
 def evaluate_homes(
-    folders: Iterable[Path], views: int, seed: int = 0, report: Callable[[str], None] = print
+    folders: Iterable[Path],
+    views: int,
+    seed: int = 0,
+    report: Callable[[str], None] = print,
+    weights: str | Path | None = None,
 ) -> Results:
-    """All rows of `METHODS` on `views` views per scene.
+    """All rows of `methods` on `views` views per scene.
 
     report: gets a line per finished home
-    Raises `InputError` if all scenes fail.
+    weights: a network with its depth estimator, as of `zerobev.load`; None: the shipped ones
+    Raises `InputError` if all scenes fail, and for weights without a network.
     """
     if views < 1:
         raise InputError(f"views: expected 1 or more, found {views}")
     folders = list(folders)
-    projectors = {row: load(row) for row in ROWS}
+    projectors = {row: load(row) for row in ROWS} if weights is None else {OWN: load(weights)}
+    if any(projector.network is None for projector in projectors.values()):
+        raise InputError(f"weights: expected a network, found P^-1 ({weights})")
+    row = list(projectors)[-1]
     homes: dict[str, HomeResult] = {}
     broken: dict[str, str] = {}
     for number, folder in enumerate(progress(folders, "homes", "home", len(folders)), start=1):
@@ -186,19 +202,20 @@ def evaluate_homes(
             report(f"[{number}/{len(folders)}] {folder.name}: skipped: {found}")
             continue
         homes[folder.name] = found
-        shown = found.counts[ROWS[-1]]
-        iou = f"({ROWS[-1]}) class {100 * shown.class_iou():.1f}, pixel {100 * shown.pixel_iou():.1f}"
+        shown = found.counts[row]
+        iou = f"({row}) class {100 * shown.class_iou():.1f}, pixel {100 * shown.pixel_iou():.1f}"
         report(f"[{number}/{len(folders)}] {folder.name}: {iou}; depth {found.depth.relative:.0%} off")
     if len(broken) == len(folders):
         raise InputError("; ".join(f"{name}: {message}" for name, message in broken.items()))
-    return Results(homes, broken)
+    return Results(homes, broken, row)
 
 
 def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Projector]) -> HomeResult:
-    camera = projectors[ROWS[0]].camera
+    first, *_ = projectors.values()
+    camera = first.camera
     batch = render_views(folder, views, camera, seed)
     with torch.inference_mode():
-        estimated = estimate(projectors[ROWS[0]].estimator, batch["rgb"], batch.get("height"))
+        estimated = estimate(first.estimator, batch["rgb"], batch.get("height"))
     true, sensor = batch["depth"].numpy()[:, 0], batch["sensor"].numpy()[:, 0]
     filled = np.stack([completed(*pair) for pair in zip(sensor, estimated.numpy()[:, 0])])
     depths = {"": estimated, ".none": torch.zeros_like(estimated)}
@@ -216,9 +233,10 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
     with torch.inference_mode():
         for row, projector in projectors.items():
             assert projector.network is not None  # as all shipped rows
-            for suffix, depth in depths.items() if row in _RESIDUAL else (("", estimated),):
+            for suffix, depth in depths.items() if projector.network.config.residual else (("", estimated),):
                 maps[row + suffix] = projector.network(batch["rgb"], batch["zero"], depth, heights).zero_logits > 0
-    counts = {row: evaluate(partial(_given, maps[row]), [batch], 1, len(LABELS)) for row in METHODS}
+    rows = methods({row: f"{row}.true" in maps for row in projectors})
+    counts = {row: evaluate(partial(_given, maps[row]), [batch], 1, len(LABELS)) for row in rows}
     return HomeResult(counts, _depth_report(batch, estimated))
 
 
@@ -248,14 +266,14 @@ def results_table(counts: dict[str, Counts]) -> pd.DataFrame:
         for statistic in (class_iou, pixel_iou):
             low, high = bootstrap_interval([one], statistic, np.random.default_rng(0))
             averages.append(f"{100 * one.value(statistic):.1f} [{100 * low:.1f}, {100 * high:.1f}]")
-        lines.append((row, METHODS[row], *(100 * one.iou_per_class()).round(1), *averages))
+        lines.append((row, _TITLES[row], *(100 * one.iou_per_class()).round(1), *averages))
     return pd.DataFrame(lines, columns=["row", "method", *LABELS, "class avg.", "pixel avg."]).set_index("row")
 
 
 def homes_table(homes: dict[str, HomeResult]) -> pd.DataFrame:
     """Per home: class IoU in percent of each row, relative depth error in percent, and floor ratio."""
     lines = {
-        name: {row: round(100 * home.counts[row].class_iou(), 1) for row in METHODS}
+        name: {row: round(100 * one.class_iou(), 1) for row, one in home.counts.items()}
         | {"depth error": round(100 * home.depth.relative, 1), "floor ratio": round(home.depth.floor_ratio, 2)}
         for name, home in homes.items()
     }
@@ -271,6 +289,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the poses")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all results there")
     parser.add_argument(
+        "--weights",
+        metavar="SOURCE",
+        help="a checkpoint or a folder of save_pretrained, instead of the shipped weights",
+    )
+    parser.add_argument(
         "--cameras", action="store_true", help=f"other cameras at {POSES} poses per scene, see evaluation.other_cameras"
     )
 
@@ -279,11 +302,14 @@ def run(options: argparse.Namespace) -> None:
     """Evaluate and print the tables; exit code 1 if a scene was skipped."""
     torch.manual_seed(0)
     if options.cameras:
+        if options.weights:
+            raise InputError("--weights: expected none with --cameras, which takes the shipped weights")
         print(
             cameras_table(evaluate_cameras(list_scenes(options.scenes), options.seed)).round(1).to_string(index=False)
         )
         return
-    results = evaluate_homes(list_scenes(options.scenes), options.views, options.seed, partial(print, flush=True))
+    report = partial(print, flush=True)
+    results = evaluate_homes(list_scenes(options.scenes), options.views, options.seed, report, options.weights)
     print(f"\n{len(results.homes)} homes, {options.views} views each; IoU in percent [90 % interval over homes]")
     print(results_table(results.counts).to_string())
     print(
