@@ -13,11 +13,19 @@ import pytest
 from zerobev.benchmarks.run import recorded_benchmark
 from zerobev.config import SCALES
 from zerobev.evaluation.metrics import Counts
-from zerobev.experiments.recorded import recorded_motion, recorded_unseen, recorded_walks
+from zerobev.evaluation.real_homes import METHODS
+from zerobev.experiments.recorded import (
+    recorded_cameras,
+    recorded_homes,
+    recorded_motion,
+    recorded_unseen,
+    recorded_walks,
+)
 from zerobev.experiments.registry import EXPERIMENTS
 from zerobev.experiments.run_records import RunStore
 from zerobev.experiments.runs import recorded
 from zerobev.experiments.workspace import Workspace
+from zerobev.inference.shipped_weights import ROWS
 from zerobev.report.claims import compare, judge
 from zerobev.report.own_rows import OWN_CLAIMS
 from zerobev.report.page import TABLES as TITLES
@@ -65,6 +73,8 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
         (recorded_benchmark, "zerobev.benchmarks.run.measure"),
         (recorded_motion, "zerobev.experiments.recorded.ensure_homes"),
         (recorded_unseen, "zerobev.experiments.recorded.ensure_homes"),
+        (recorded_cameras, "zerobev.experiments.recorded.ensure_homes"),
+        (recorded_homes, "zerobev.experiments.recorded.ensure_homes"),
         (recorded_walks, "zerobev.experiments.recorded.ensure_homes"),
     ],
 )
@@ -96,6 +106,14 @@ def test_the_readme_holds_the_numbers_of_the_records():
     for (row, method), values in results.iterrows():
         cells = [f"{values[iou, 'ours']:.1f} ({values[iou, 'paper']:.1f})" for iou in ("class avg.", "pixel avg.")]
         assert f"| ({row}) | {method} | {cells[0]} | {cells[1]} |" in readme
+
+
+def test_the_readme_holds_the_numbers_of_the_shipped_weights():
+    rows, readme = recorded_homes(Workspace("reduced"))["rows"], (ROOT / "README.md").read_text()
+    for row in ("a.1", "a.2", *ROWS, "d.sensor", "d.true", "constant"):
+        name = row if row == "constant" else f"({row})"
+        averages = [f"{100 * rows[row][kind]:.1f}" for kind in ("class_iou", "pixel_iou")]
+        assert f"| {name} | {METHODS[row]} | {averages[0]} | {averages[1]} |" in readme
 
 
 def test_the_readme_holds_the_numbers_of_the_gpu():
