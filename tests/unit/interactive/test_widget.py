@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from skimage.transform import resize
 
 import zerobev
 from zerobev.common.errors import InputError
@@ -29,7 +30,8 @@ def model() -> zerobev.Projector:
 
 @pytest.fixture(scope="module")
 def rgb() -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    """The package's photograph, small."""
+    return np.round(255 * resize(example()[0][32:224], SHAPE)).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
