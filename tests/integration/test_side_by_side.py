@@ -65,7 +65,7 @@ def found(run: Run) -> tuple[dict, bytes]:
 
 
 def forget(run: Run) -> None:
-    run.store.path(run.key).unlink()
+    run.store.path(run.key).unlink(missing_ok=True)
     shutil.rmtree(run.folder)
 
 
@@ -112,14 +112,17 @@ def test_a_failing_run_does_not_end_the_others(runs, capsys):
 def test_an_interrupted_call_ends_its_processes_and_is_continued(runs, home):
     """The signal reaches the first process alone."""
     before = {row: found(runs[row]) for row in ("c", "f")}
-    for row in before:
-        forget(runs[row])
-    first = start(home, *SEVERAL)
-    while not (runs["c"].folder / "checkpoint.pt").exists():
-        assert first.poll() is None, first.communicate()
-        time.sleep(0.02)
-    first.send_signal(signal.SIGTERM)
-    assert first.wait(60) == 1 and "interrupted" in first.communicate()[1]
+    for _ in range(5):  # on a busy machine the signal may come after the last step
+        for row in before:
+            forget(runs[row])
+        first = start(home, *SEVERAL)
+        while not (runs["c"].folder / "checkpoint.pt").exists():
+            assert first.poll() is None, first.communicate()
+            time.sleep(0.02)
+        first.send_signal(signal.SIGTERM)
+        assert first.wait(60) == 1 and "interrupted" in first.communicate()[1]
+        if not runs["c"].recorded():
+            break
     with locked(runs["c"].folder, "work"), locked(runs["f"].folder, "work"):
         assert not runs["c"].recorded()
     cli.main(SEVERAL)
