@@ -17,7 +17,7 @@ from zerobev.data.shards import Shard
 from zerobev.data.view_set import ViewSet
 from zerobev.evaluation.evaluate import evaluate, model_predictor
 from zerobev.evaluation.metrics import Counts
-from zerobev.evaluation.real_homes import METHODS, DepthReport, Results, evaluate_homes, render_views
+from zerobev.evaluation.real_homes import METHODS, DepthReport, HomeResult, Results, evaluate_homes, render_views
 from zerobev.geometry.projection import inverse_project
 from zerobev.inference.projector import load
 from zerobev.inference.shipped_weights import ROWS, run_of, shipped
@@ -89,6 +89,15 @@ def test_depth_errors_and_reasons(homes, results):
     assert report.relative == pytest.approx(float(error), rel=1e-4)
     floor = known & (batch["zero"][:, [LABELS.index("floor")]] > 0)
     assert report.floor_ratio == pytest.approx(float((estimated / batch["depth"])[floor].median()), rel=1e-4)
+    seen = np.full((1, 8), 100)
+    result = HomeResult(
+        {
+            "a.1": Counts(np.array([[50, 50, 50, 50, 9, 0, 50, 50]]), seen),
+            "d": Counts(np.array([[50, 13, 12, 0, 0, 0, 50, 50]]), seen),
+        },
+        results.homes["00001-HomeA"].depth,
+    )
+    assert result.lost_classes("d") == ["chair", "sofa"]
     good = DepthReport(relative=0.1, mad_m=0.2, floor_ratio=1.0, brightness=0.5, median_m=2.0)
     assert good.reasons() == "no reason found in estimated depth, light or distances"
     assert "puts the floor at 0.50 of its distance" in replace(good, floor_ratio=0.5, relative=0.5).reasons()

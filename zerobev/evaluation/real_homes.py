@@ -67,7 +67,8 @@ _TITLES = METHODS | methods({OWN: True})
 _FLOOR = LABELS.index("floor")
 _WORST = 3  # homes that are discussed
 # from here on, a property of a home counts as a reason of its failure
-_FLOOR_OFF, _DEPTH_OFF, _DARK, _NEAR_M = 0.1, 0.2, 0.25, 1.5
+_FLOOR_OFF, _DEPTH_OFF, _DARK, _NEAR_M = 0.1, 0.15, 0.25, 1.5
+_LOST, _FOUND = 0.25, 0.1  # a class is lost below this fraction of P^-1's IoU with true depth, if that is not small
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,11 @@ class HomeResult:
     counts: dict[str, Counts]
     depth: DepthReport
 
+    def lost_classes(self, row: str) -> list[str]:
+        """The classes that P^-1 with true depth finds, and a row hardly."""
+        true, predicted = (self.counts[name].iou_per_class() for name in (ORACLE, row))
+        return [name for name, a, b in zip(LABELS, true, predicted) if a > _FOUND and b < _LOST * a]
+
 
 @dataclass(frozen=True)
 class Results:
@@ -128,11 +134,13 @@ class Results:
         def share(home: HomeResult) -> float:
             return home.counts[self.row].class_iou() / max(home.counts[ORACLE].class_iou(), 1e-9)
 
-        by_share = sorted(self.homes.items(), key=lambda item: share(item[1]))
-        return [
-            f"{name}: ({self.row}) has {share(home):.2f} of ({ORACLE})'s class IoU; {home.depth.reasons()}"
-            for name, home in by_share[:_WORST]
-        ]
+        lines = []
+        for name, home in sorted(self.homes.items(), key=lambda item: share(item[1]))[:_WORST]:
+            lost = f"; lost classes: {', '.join(names)}" if (names := home.lost_classes(self.row)) else ""
+            lines.append(
+                f"{name}: ({self.row}) has {share(home):.2f} of ({ORACLE})'s class IoU{lost}; {home.depth.reasons()}"
+            )
+        return lines
 
     def to_json(self) -> dict[str, Any]:
         """Averages, counts per home in the order of `scenes`, and depth errors, as plain data."""
