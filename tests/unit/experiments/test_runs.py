@@ -307,9 +307,14 @@ def test_a_scale_for_any_camera_and_depth(tmp_path, monkeypatch):
     assert records["a.1"].counts.pixel_iou() > 0.2
     assert records["d"].config["mixed_depth"] and "mixed_depth" not in records["c"].config
     residual = Run(EXPERIMENTS["d"], workspace)
-    assert residual.experiment.stages(tiny) == ("mixed",) and ZeroBEV.load(residual.weights).embedding.in_channels == 2
+    assert residual.experiment.stages(tiny) == ("mixed",)
+    assert (
+        ZeroBEV.load(residual.weights).config.measured
+        and not ZeroBEV.load(Run(EXPERIMENTS["c"], workspace).weights).config.measured
+    )
     batch = residual.source("train", "mixed", 0).batch(0)
     assert batch["height"].shape == (2,) and batch["rgb"].dtype == torch.uint8
+    assert batch["depth"].shape[1] == 2 and set(batch["depth"][:, 1].unique().tolist()) <= {0.0, 1.0}
     again = residual.source("train", "mixed", 0).batch(0)
     assert all(torch.equal(batch[name], again[name]) for name in batch)
 
