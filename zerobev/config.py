@@ -174,11 +174,6 @@ class ModelConfig:
     own_rays: bool = False  #: the depth estimator reads the rays of the image's own camera, from its height
     segmentation: bool = False  #: masks of the eight classes as input (TIM, row (b.3))
 
-    @property
-    def projected(self) -> int:
-        """Number of maps by P^-1 that a residual network reads per zero-shot image."""
-        return 1 + self.seen + self.measured
-
 
 @dataclass(frozen=True)
 class TrainConfig:

@@ -149,7 +149,7 @@ class ZeroShotModel(BevModel):
         self.check(features[0].shape[0], zero=(zero, None))
         if not self.config.residual:
             return self.project_images(features, zero, None)
-        of_depth = self.config.projected
+        of_depth = projected_maps(self.config)
         (cells, *of_view), rest = features[:of_depth], features[of_depth:]
         projected = pooled_in_cells(zero, cells, self.camera.bev_px)
         maps = [projected, *(one.expand_as(projected) for one in of_view)]
@@ -166,6 +166,11 @@ class ZeroShotModel(BevModel):
             `measured` of its measured pixels; None: not the residual variant
         """
         raise NotImplementedError
+
+
+def projected_maps(model: ModelConfig) -> int:
+    """Number of maps by P^-1 that a residual network reads per zero-shot image."""
+    return 1 + model.seen + model.measured
 
 
 def in_passes(images: Tensor, size: int, dim: int = 0) -> Sequence[Tensor]:

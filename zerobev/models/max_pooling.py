@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from zerobev.config import CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder
-from zerobev.models.base import IMAGES_PER_PASS, Features, MapLogits, ZeroShotModel, in_passes
+from zerobev.models.base import IMAGES_PER_PASS, Features, MapLogits, ZeroShotModel, in_passes, projected_maps
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.polar import PolarToCartesian, floor_row
 from zerobev.models.pyramid import FeaturePyramid
@@ -102,7 +102,7 @@ class MaxPoolZeroBEV(ZeroShotModel):
         self.resample_pixels = PolarToCartesian(camera, rows, 1)
         self.resample_features = PolarToCartesian(camera, rows, stride)
         self.values = nn.Conv2d(model.width, model.width, 1)
-        self.embedding = nn.Conv2d(1 + model.residual * model.projected, model.width, 1)
+        self.embedding = nn.Conv2d(1 + model.residual * projected_maps(model), model.width, 1)
         with torch.no_grad():
             self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))

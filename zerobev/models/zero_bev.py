@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from zerobev.config import CameraConfig, ModelConfig
 from zerobev.models.backbone import RgbEncoder, ZeroCNN
 from zerobev.models.band_transformer import BandAttention
-from zerobev.models.base import IMAGES_PER_PASS, Features, MapLogits, ZeroShotModel, in_passes
+from zerobev.models.base import IMAGES_PER_PASS, Features, MapLogits, ZeroShotModel, in_passes, projected_maps
 from zerobev.models.decoder import BevDecoder
 from zerobev.models.fpv_to_bev import FpvToBev
 from zerobev.models.pyramid import FeaturePyramid
@@ -36,7 +36,7 @@ class ZeroBEV(ZeroShotModel):
         self.pyramid = FeaturePyramid(tuple(map(sum, zip(model.channels, model.zero_channels))), model.width)
         self.bands = FpvToBev(camera, model)
         if model.residual:
-            self.embedding = nn.Conv2d(model.projected, model.width, 1)
+            self.embedding = nn.Conv2d(projected_maps(model), model.width, 1)
             with torch.no_grad():
                 self.embedding.weight.mul_(model.residual_init_gain)
         self.decoder = BevDecoder(model.width, model.decoder_channels, 1 + len(model.aux))
