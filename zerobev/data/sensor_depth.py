@@ -56,6 +56,11 @@ def with_measured(measured: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return np.stack([depth, measured > 0], axis=-3).astype(np.float32)
 
 
+def fused(measured: np.ndarray, estimated: np.ndarray) -> np.ndarray:
+    """Measured depth, `completed` by the estimate, with the mask of `with_measured`: (2, H, W) float32."""
+    return with_measured(measured, completed(measured, estimated))
+
+
 def exaggerated(estimated: np.ndarray, depth: np.ndarray, power: float) -> np.ndarray:
     """`depth * (estimated / depth) ** power`, (H, W) float32, metres; the estimate itself where true depth is 0."""
     known = (depth > 0) & (estimated > 0)
@@ -66,7 +71,7 @@ def exaggerated(estimated: np.ndarray, depth: np.ndarray, power: float) -> np.nd
 def mixed_depth(depth: np.ndarray, estimated: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Depth of a random quality: true, measured, estimated, or missing, in part or wholly.
 
-    Measured depth is completed by the estimate in half of the samples; otherwise its holes stay 0. Errors of the
+    Measured depth is completed by the estimate in half of these samples; in others its holes stay 0. Errors of the
     estimate are exaggerated at random.
     Returns (2, H, W) float32: metres, and 1 where depth is true or measured.
     """
@@ -78,7 +83,7 @@ def mixed_depth(depth: np.ndarray, estimated: np.ndarray, rgb: np.ndarray, rng: 
         none = np.zeros_like(estimated)
         return with_measured(none, estimated if kind == 1 else none)
     measured = sensor_depth(depth, rgb, rng)
-    return with_measured(measured, completed(measured, estimated) if kind == 3 else measured)
+    return fused(measured, estimated) if kind == 3 else with_measured(measured, measured)
 
 
 def _ellipse(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

@@ -27,7 +27,7 @@ from zerobev.common.progress import progress
 from zerobev.common.storage import write_json
 from zerobev.config import LABELS, CameraConfig, TextureConfig
 from zerobev.data.samples import as_float, class_masks, collate, view_sample
-from zerobev.data.sensor_depth import completed, sensor_depth, with_measured
+from zerobev.data.sensor_depth import fused, sensor_depth, with_measured
 from zerobev.data.views import ViewSource
 from zerobev.evaluation.evaluate import evaluate
 from zerobev.evaluation.metrics import Counts, bootstrap_interval, class_iou, pixel_iou
@@ -224,12 +224,13 @@ def _home_result(folder: Path, views: int, seed: int, projectors: dict[str, Proj
     batch = render_views(folder, views, camera, seed)
     with torch.inference_mode():
         estimated = estimate(first.estimator, batch["rgb"], batch.get("height"))
-    true, sensor = batch["depth"].numpy()[:, 0], batch["sensor"].numpy()[:, 0]
-    filled = np.stack([completed(*pair) for pair in zip(sensor, estimated.numpy()[:, 0])])
-    depths = {"": estimated, ".none": torch.zeros_like(estimated)}
-    depths |= {
-        suffix: torch.from_numpy(with_measured(*pair))
-        for suffix, pair in ((".true", (true, true)), (".sensor", (sensor, filled)))
+    true = batch["depth"].numpy()[:, 0]
+    measured = [fused(*pair) for pair in zip(batch["sensor"].numpy()[:, 0], estimated.numpy()[:, 0])]
+    depths = {
+        "": estimated,
+        ".none": torch.zeros_like(estimated),
+        ".true": torch.from_numpy(with_measured(true, true)),
+        ".sensor": torch.from_numpy(np.stack(measured)),
     }
     heights = batch.get("height")
     maps = {

@@ -19,7 +19,7 @@ from torch import Tensor
 from zerobev.common.progress import progress
 from zerobev.config import LABELS, AgentConfig, CameraConfig
 from zerobev.data.samples import as_float
-from zerobev.data.sensor_depth import completed, sensor_depth, with_measured
+from zerobev.data.sensor_depth import fused, sensor_depth
 from zerobev.evaluation.home_scores import HomeScores
 from zerobev.evaluation.real_homes import METHODS, ORACLE
 from zerobev.geometry.cameras import Pose
@@ -156,9 +156,8 @@ def walk_maps(walked: Walk, rows: Collection[str] = tuple(WALK_ROWS)) -> dict[st
     estimator = load(GEOMETRIC).estimator
     with torch.inference_mode():
         estimated = torch.cat([estimator(as_float(part)["rgb"]) for part in _chunks(walked.views)])
-    sensor = walked.views["sensor"].numpy()[:, 0]
-    filled = np.stack([completed(*pair) for pair in zip(sensor, estimated.numpy()[:, 0])])
-    measured = torch.from_numpy(with_measured(sensor, filled))
+    pairs = zip(walked.views["sensor"].numpy()[:, 0], estimated.numpy()[:, 0])
+    measured = torch.from_numpy(np.stack([fused(*pair) for pair in pairs]))
     found = {}
     for row in rows:
         name = row.removesuffix(".sensor")

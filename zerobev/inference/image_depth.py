@@ -10,7 +10,7 @@ from torch import Tensor
 
 from zerobev.common.errors import InputError
 from zerobev.config import CameraConfig
-from zerobev.data.sensor_depth import completed, with_measured
+from zerobev.data.sensor_depth import fused, with_measured
 from zerobev.geometry.cameras import Camera
 from zerobev.inference.measured_depth import MAX_MEDIAN_M
 from zerobev.inference.pinhole import PinholeView
@@ -44,8 +44,8 @@ def image_depths(
         if depth is None:
             depths.append(with_measured(np.zeros_like(estimated[number]), estimated[number]) * view.covered)
         else:
-            filled = completed(depth, estimated[number]) if number in estimated else depth
-            depths.append(with_measured(depth, filled) * view.covered)
+            whole = fused(depth, estimated[number]) if number in estimated else with_measured(depth, depth)
+            depths.append(whole * view.covered)
     return np.stack(depths)
 
 
