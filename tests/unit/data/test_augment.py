@@ -208,13 +208,13 @@ def test_depth_of_any_quality_occurs():
     rng = np.random.default_rng(0)
     depth, estimated = np.full((48, 48), 2.0, np.float32), np.full((48, 48), 3.0, np.float32)
     grey, kinds = np.full((48, 48, 3), 128, np.uint8), []
-    for _ in range(200):
+    for _ in range(400):
         found, measured = mixed_depth(depth, estimated, grey, rng)
         if np.array_equal(found, depth):
             assert measured.all()
             kinds.append("true")
         elif found.min() == found.max() and found.min() >= 3:  # errors are exaggerated, never reduced
-            assert found.max() <= 2 * (3 / 2) ** 2 + 1e-6  # up to the square of the ratio
+            assert found.max() <= 2 * (3 / 2) ** 1.6 + 1e-6
             assert not measured.any()
             kinds.append("estimated")
         elif not found.any():

@@ -56,6 +56,6 @@ def test_mixed_depth_has_all_qualities_with_larger_errors_of_estimates():
     found = [mixed_depth(depth, estimated, GREY, np.random.default_rng(seed))[0] for seed in range(400)]
     whole = np.array([one.flat[0] for one in found if (one == one.flat[0]).all()])
     errors = np.unique(whole[whole > 2.1])  # estimates alone: measured depth is not the same everywhere
-    assert (whole == 0).mean() > 0.2 and (whole == 2.0).mean() > 0.2
-    assert errors.min() == pytest.approx(2.4, abs=0.02) and errors.max() == pytest.approx(2.88, abs=0.02)
-    assert 40 < len(errors) < 130  # one kind of five
+    assert (whole == 0).mean() > 0.1 and (whole == 2.0).mean() > 0.1
+    assert errors.min() == pytest.approx(2.4, abs=0.02) and errors.max() == pytest.approx(2.4 * 1.2**0.6, abs=0.02)
+    assert 160 < len(errors) < 240  # half of the samples
