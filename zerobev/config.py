@@ -214,7 +214,7 @@ class Scale:
     objects_fraction: float = 0.0  #: fraction of *Synth* samples with whole instances in white (not in the paper)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     relative_depth: bool = False  #: the depth estimator's loss is the relative error (not in the paper)
-    #: residual networks are trained with depth of any quality, and know which is measured (not in the paper)
+    #: residual networks start from (c), train with depth of any quality, and know which is measured (not in the paper)
     mixed_depth: bool = False
     test_views: int | None = None  #: networks are evaluated on the first so many of each test scene; None: all
     #: initial weights of the RGB backbones, for `load_backbone`; empty: the depth estimator's

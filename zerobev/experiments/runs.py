@@ -76,8 +76,8 @@ class Run:
             config |= {"extruded_fraction": wanted.extruded_fraction(scale), "augment": scale.augment}
             if scale.objects_fraction and wanted.stream == "synth":
                 config |= {"objects_fraction": scale.objects_fraction}
-            if scale.mixed_depth and wanted.reads_depth:
-                config |= {"mixed_depth": versions.MIXED_DEPTH}
+            if self.start is not None:
+                config |= {"mixed_depth": versions.MIXED_DEPTH, "start": self.start.key}
         return config
 
     @property
@@ -116,6 +116,16 @@ class Run:
         scale = self.workspace.scale
         is_vpn = self.experiment.network is not None and VARIANTS[self.experiment.network][0] is VPN
         return scale.vpn_backbone if is_vpn else scale.backbone
+
+    @cached_property
+    def start(self) -> "Run | None":
+        """The run whose weights this one starts from; None: the weights are drawn, apart from the RGB backbone's.
+
+        Residual networks of mixed depth start from (c): without depth they are then as good as it is.
+        """
+        if self.experiment.network is None or not (self.workspace.scale.mixed_depth and self.experiment.reads_depth):
+            return None
+        return Run(experiment("c"), self.workspace, self.seed)
 
     def recorded(self) -> RunRecord | None:
         """Its record; None if it has to be computed."""
@@ -183,14 +193,18 @@ class Run:
     def train(self) -> tuple[BevModel, History]:
         """The network with its best weights, and its training history; the network is also written to `weights`.
 
-        The RGB backbone starts from pretrained weights, the rest from the seed. Validation uses the stream of training,
-        the depth of the last stage and a fixed seed, so that scores of runs are comparable.
+        The RGB backbone starts from pretrained weights, the rest from the seed or from `start`. Validation uses the
+        stream of training, the depth of the last stage and a fixed seed, so that scores of runs are comparable.
         """
         wanted, scale, config = self.experiment, self.workspace.scale, self.workspace.scale.train
         assert wanted.network is not None  # P^-1 is not trained
         torch.manual_seed(self.seed)
         model = build(wanted.network, scale.camera, wanted.model(scale))
         load_backbone(model.backbone, self.backbone or self.pretraining.weights)
+        if self.start is not None:
+            if not self.start.weights.exists():
+                self.start.train()
+            model.load_common(self.start.weights)
         data = InTurn([self.source("train", depth, self.seed) for depth in wanted.stages(scale)], config.steps)
         held_out = self.source("validation", wanted.stages(scale)[-1], seed=0)
         validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]

@@ -80,6 +80,18 @@ class BevModel(nn.Module):
         with replacing(path) as temporary:
             save_file(tensors, temporary, metadata={"zerobev": json.dumps(described, sort_keys=True)})
 
+    def load_common(self, path: Path) -> None:
+        """Replace the weights that the checkpoint `path` has with the same name and shape.
+
+        Raises `InputError` if the file cannot be read, or has no such weight.
+        """
+        description(path)
+        own = self.state_dict()
+        common = {name: t for name, t in load_file(path).items() if name in own and own[name].shape == t.shape}
+        if not common:
+            raise InputError(f"{path}: expected weights of {type(self).__name__}, found none of its names and shapes")
+        self.load_state_dict(common, strict=False)
+
     @classmethod
     def load(cls, path: Path) -> Self:
         """The network saved in `path`, on the CPU, in evaluation mode.
