@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from zerobev.common.errors import InputError
 from zerobev.common.keys import plain
@@ -317,6 +318,20 @@ def test_a_scale_for_any_camera_and_depth(tmp_path, monkeypatch):
     assert batch["depth"].shape[1] == 2 and set(batch["depth"][:, 1].unique().tolist()) <= {0.0, 1.0}
     again = residual.source("train", "mixed", 0).batch(0)
     assert all(torch.equal(batch[name], again[name]) for name in batch)
+    # (d) starts from (c)
+    start, first = Run(EXPERIMENTS["c"], workspace), {}
+    assert start.start is None and records["d"].config["start"] == start.key
+    monkeypatch.setattr(BevModel, "save", lambda *_: None)  # the recorded weights stay
+    monkeypatch.setattr(runs, "train", lambda model, *_, **__: first.update(model.state_dict()))
+    residual.train()
+    assert all(torch.equal(first[name], weight) for name, weight in load_file(start.weights).items())
+    # without weights (c) is trained first
+    shutil.move(start.weights, tmp_path / "c.safetensors")
+    monkeypatch.setattr(
+        runs, "train", lambda _, data, *__, **___: pytest.fail(f"trains with {data.batch(0)['depth'].shape}")
+    )
+    with pytest.raises(pytest.fail.Exception, match=r"trains with .*\[2, 1, 32, 32\]"):
+        residual.train()
 
 
 def test_a_scene_folder_that_is_missing_is_named(tmp_path):

@@ -432,6 +432,30 @@ def test_checkpoints_of_other_classes_are_named(tmp_path):
         load_model(path)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("row", ["d", "f.r"])
+def test_a_residual_network_may_start_from_another_network(row, tmp_path):
+    """All parts that both networks have are taken; without its embedding (d) is then (c)."""
+    start, net, (rgb, zero, depth) = network("c"), network(row), inputs(2, 3)
+    start.save(tmp_path / "c.safetensors")
+    net.load_common(tmp_path / "c.safetensors")
+    for part in ("backbone", "decoder"):
+        ours, theirs = (model.get_submodule(part).state_dict() for model in (net, start))
+        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    for parameter in net.embedding.parameters():
+        parameter.zero_()
+    same = torch.equal(net(rgb, zero, depth).zero_logits, start(rgb, zero, depth).zero_logits)
+    assert same == (row == "d")
+
+
+def test_a_start_without_a_common_weight_is_named(tmp_path):
+    path, net = tmp_path / "other.safetensors", network("d")
+    described = json.dumps({"class": "Other", "camera": {}, "model": {}})
+    save_file({"other": torch.zeros(1)}, path, metadata={"zerobev": described})
+    with pytest.raises(InputError, match=r"other.safetensors: expected weights of ZeroBEV, found none of its names"):
+        net.load_common(path)
+
+
 # --- learning
 
 
