@@ -59,6 +59,5 @@ def run(options: argparse.Namespace) -> None:
     if checkout() is None:
         raise InputError("release: expected a checkout of the project, found an installed package")
     for name, source in sources().items():
-        if isinstance(source, Run) and not source.weights.exists():
-            source.train()
-        halve(source.weights, FOLDER / f"{name}.safetensors", source.key)
+        weights = source.trained() if isinstance(source, Run) else source.weights
+        halve(weights, FOLDER / f"{name}.safetensors", source.key)

@@ -202,9 +202,7 @@ class Run:
         model = build(wanted.network, scale.camera, wanted.model(scale))
         load_backbone(model.backbone, self.backbone or self.pretraining.weights)
         if self.start is not None:
-            if not self.start.weights.exists():
-                self.start.train()
-            model.load_common(self.start.weights)
+            model.load_common(self.start.trained())
         data = InTurn([self.source("train", depth, self.seed) for depth in wanted.stages(scale)], config.steps)
         held_out = self.source("validation", wanted.stages(scale)[-1], seed=0)
         validation = [held_out.batch(step) for step in range(VALIDATION_BATCHES)]
@@ -223,6 +221,16 @@ class Run:
         if rank_and_world_size()[0] == 0:
             model.save(self.weights)
         return model, history
+
+    def trained(self) -> Path:
+        """`weights`, after a training if the file is missing.
+
+        Raises `InputError` if another process computes this run.
+        """
+        if not self.weights.exists():
+            with self.workspace.alone(self.key):
+                self.train()
+        return self.weights
 
     def source(self, split: Split, depth: Depth, seed: int) -> Source:
         """Training samples of a split."""
