@@ -70,7 +70,8 @@ def test_counts_are_those_of_recorded_shards(homes, counts, tmp_path):
 
 
 def test_every_row_is_another_method(counts):
-    assert list(counts) == list(METHODS) == ["a.1", "a.2", "c", "d", "d.none", "d.sensor", "d.true", "constant"]
+    residual = [row + depth for row in ("f.r", "d") for depth in (".none", ".sensor", ".true")]
+    assert list(counts) == list(METHODS) == ["a.1", "a.2", "c", "f.r", "d", *residual, "constant"]
     unions = [tuple(one.union.ravel()) for one in counts.values()]
     assert len(set(unions)) == len(unions)
     # true depth knows the visible floor; estimated depth on coloured boxes does not

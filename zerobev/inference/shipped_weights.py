@@ -8,7 +8,7 @@ from safetensors import safe_open
 from zerobev.common.errors import InputError
 
 #: Rows with shipped weights; the last one is the default of `zerobev.load`.
-ROWS = ("c", "d")
+ROWS = ("c", "f.r", "d")
 #: Name of the depth estimator among the shipped files.
 DEPTH = "depth"
 
