@@ -14,6 +14,7 @@ from zerobev.benchmarks.run import recorded_benchmark
 from zerobev.config import SCALES
 from zerobev.evaluation.metrics import Counts
 from zerobev.evaluation.real_homes import METHODS
+from zerobev.experiments.looks import recorded_looks
 from zerobev.experiments.recorded import (
     recorded_cameras,
     recorded_homes,
@@ -75,6 +76,7 @@ def test_a_seal_is_broken_by_the_last_digit_of_one_number(tmp_path: Path):
         (recorded_unseen, "zerobev.experiments.recorded.ensure_homes"),
         (recorded_cameras, "zerobev.experiments.recorded.ensure_homes"),
         (recorded_homes, "zerobev.experiments.recorded.ensure_homes"),
+        (lambda _: recorded_looks(), "zerobev.experiments.looks.ensure_homes"),
         (recorded_walks, "zerobev.experiments.recorded.ensure_homes"),
     ],
 )
