@@ -61,6 +61,7 @@ def test_masks_by_hand(views):
 def test_counts_are_sums_over_the_masks_of_a_modality(tmp_path, monkeypatch):
     write_scene(tmp_path / "00001-HomeA", build(furnished()))
     answers = {"a.2": lambda b: b["target"] > 0.5, "c": lambda b: b["target"] < 0, "d": lambda b: b["target"] >= 0}
+    monkeypatch.setattr(unseen, "ROWS", ("c", "d"))
     monkeypatch.setattr(unseen, "load", lambda row: SimpleNamespace(camera=CAMERA, predict=answers[row]))
     counts = evaluate_unseen([tmp_path / "00001-HomeA"], views=3)
     assert np.array_equal(counts["a.2"].intersection, counts["a.2"].union)
