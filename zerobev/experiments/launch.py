@@ -90,7 +90,7 @@ def _compute_several(runs: Sequence[Run], dask: str | None, arguments: Sequence[
 
 
 def _prepare(runs: Sequence[Run], dask: str | None) -> PartialState:
-    """Make what runs of one workspace share: views, textures, the depth estimator and its estimates."""
+    """Make what runs share: views, textures, the depth estimator, its estimates, and the weights of `Run.start`."""
     workspace, pretraining = runs[0].workspace, runs[0].pretraining
     learned = [wanted for wanted in runs if wanted.experiment.network]
     with _one_at_a_time(workspace), cluster(dask):
@@ -108,6 +108,8 @@ def _prepare(runs: Sequence[Run], dask: str | None) -> PartialState:
         with _one_at_a_time(workspace):
             for split in estimated:
                 pretraining.views(split)
+    for start in dict.fromkeys(wanted.start for wanted in learned if wanted.start is not None):
+        start.trained()  # here, since runs side by side would train it at the same time
     return state
 
 

@@ -14,7 +14,7 @@ from zerobev.common.keys import plain
 from zerobev.common.locks import locked
 from zerobev.config import LABELS, SCALES, SceneConfig, TextureConfig, TrainConfig
 from zerobev.data.samples import as_float, semantic_batches
-from zerobev.experiments import runs
+from zerobev.experiments import launch, runs
 from zerobev.experiments.depth_pretraining import DepthPretraining
 from zerobev.experiments.gallery import gallery
 from zerobev.experiments.registry import EXPERIMENTS, experiment
@@ -325,6 +325,12 @@ def test_a_scale_for_any_camera_and_depth(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "train", lambda model, *_, **__: first.update(model.state_dict()))
     residual.train()
     assert all(torch.equal(first[name], weight) for name, weight in load_file(start.weights).items())
+    # runs side by side find it trained
+    made = []
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "trained", lambda run: made.append(run.name))
+        launch._prepare([start, residual, Run(EXPERIMENTS["f.r"], workspace)], None)
+    assert made == ["c seed 0"]
     # without weights (c) is trained first
     shutil.move(start.weights, tmp_path / "c.safetensors")
     monkeypatch.setattr(
