@@ -13,13 +13,18 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success rename it to `path`, on any error remove it.
 
     The parent folder is created. The temporary name keeps the suffix and contains the process id, so two processes can
-    write the same file: the later rename wins.
+    write the same file: the later rename wins. Permissions are those of a new file, whatever the writer sets: some
+    libraries allow only the owner to read.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        temporary.unlink()
         yield temporary
+        temporary.chmod(mode)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
