@@ -82,6 +82,7 @@ def _compute_several(runs: Sequence[Run], dask: str | None, arguments: Sequence[
     failed = 0
     if missing:
         _prepare(missing, dask)
+        _train_starts(missing)
         failed = compute_all(missing, arguments, jobs)
     counts = f"{len(missing) - failed} computed, {len(skipped)} recorded before, {failed} failed"
     print(f"{len(runs)} runs: {counts}; {time.monotonic() - begin:.0f} s")
@@ -90,7 +91,7 @@ def _compute_several(runs: Sequence[Run], dask: str | None, arguments: Sequence[
 
 
 def _prepare(runs: Sequence[Run], dask: str | None) -> PartialState:
-    """Make what runs share: views, textures, the depth estimator, its estimates, and the weights of `Run.start`."""
+    """Make what runs of one workspace share: views, textures, the depth estimator and its estimates."""
     workspace, pretraining = runs[0].workspace, runs[0].pretraining
     learned = [wanted for wanted in runs if wanted.experiment.network]
     with _one_at_a_time(workspace), cluster(dask):
@@ -108,9 +109,13 @@ def _prepare(runs: Sequence[Run], dask: str | None) -> PartialState:
         with _one_at_a_time(workspace):
             for split in estimated:
                 pretraining.views(split)
-    for start in dict.fromkeys(wanted.start for wanted in learned if wanted.start is not None):
-        start.trained()  # here, since runs side by side would train it at the same time
     return state
+
+
+def _train_starts(runs: Sequence[Run]) -> None:
+    """Train the weights that runs start from; side by side, several runs would train them at the same time."""
+    for start in dict.fromkeys(wanted.start for wanted in runs if wanted.start is not None):
+        start.trained()
 
 
 def _estimated(wanted: Run) -> list[Split]:

@@ -41,7 +41,6 @@ def halve(source: Path, target: Path, run: str) -> None:
     metadata = {"zerobev": json.dumps({**described, "run": run}, sort_keys=True)}
     with replacing(target) as temporary:
         save_file(halves, temporary, metadata=metadata)
-        temporary.chmod(0o644)
 
 
 def sources() -> dict[str, Run | DepthPretraining]:

@@ -329,7 +329,7 @@ def test_a_scale_for_any_camera_and_depth(tmp_path, monkeypatch):
     made = []
     with monkeypatch.context() as patch:
         patch.setattr(Run, "trained", lambda run: made.append(run.name))
-        launch._prepare([start, residual, Run(EXPERIMENTS["f.r"], workspace)], None)
+        launch._train_starts([Run(PROJECTION, workspace), start, residual, Run(EXPERIMENTS["f.r"], workspace)])
     assert made == ["c seed 0"]
     # without weights (c) is trained first
     shutil.move(start.weights, tmp_path / "c.safetensors")
