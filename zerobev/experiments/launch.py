@@ -63,7 +63,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _compute_one(wanted: Run, dask: str | None) -> None:
     """Compute a run in this process, alone or with the other processes of a launch."""
-    state = _prepare([wanted], dask)
+    is_recorded = isinstance(attempt(wanted.recorded), RunRecord)
+    state = PartialState(cpu=not torch.cuda.is_available()) if is_recorded else _prepare([wanted], dask)
     record = wanted.record()
     if state.is_main_process:
         print(result_line(wanted, record))

@@ -279,6 +279,14 @@ def test_spot_check_agrees_only_with_an_unchanged_record(workspace):
         spot_check(workspace, "z")
 
 
+def test_a_recorded_row_needs_no_data(workspace, monkeypatch, capsys):
+    run = Run(PROJECTION, workspace)
+    run.record()
+    monkeypatch.setattr(launch, "_prepare", None)
+    launch._compute_one(run, None)
+    assert f"{run.key}.json: IoU in percent" in capsys.readouterr().out
+
+
 def test_a_training_is_not_computed_twice_at_a_time(workspace, monkeypatch):
     run = Run(ZERO_BEV, workspace)
     monkeypatch.setenv("ZEROBEV_FRESH", "9e9")  # no record is new enough
